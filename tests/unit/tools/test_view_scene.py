@@ -11,6 +11,7 @@ import shlex
 from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -32,10 +33,18 @@ from mstools.commands.demo import find_vehicle_file
 from mstools.commands.new import TEMPLATES, Device, NewVehicle, make_geometry
 from mstools.commands.view import open_source
 from mstools.recordings.drive import Picture
-from mstools.view.camera import VIEWS, fit_camera
+from mstools.view.camera import VIEWS, fit_camera, project
 from mstools.view.meshes import MeshError, MeshFolders
 from mstools.view.page import Page, escape_markdown, open_page
-from mstools.view.scene import CHI_SQUARE_3, MARK_SCALE, OUTLINE_SCALE, NameLabels, VehicleScene, compute_ellipsoid
+from mstools.view.scene import (
+    CHI_SQUARE_3,
+    LABEL_PX,
+    MARK_SCALE,
+    OUTLINE_SCALE,
+    NameLabels,
+    VehicleScene,
+    compute_ellipsoid,
+)
 from mstools.view.sources import Source, list_coordinates, open_geometry
 from mstools.view.viewer import describe_answer, describe_unread, format_code
 
@@ -335,6 +344,37 @@ bodies:
     assert scene._mark is None
 
 
+def test_given_a_camera_then_no_name_covers_another_and_the_chosen_ones_are_shown(page: Page) -> None:
+    scene = make_scene(page, open_geometry(find_vehicle_file(), {}))
+    scene.show(Picture(1))
+    position, look_at = fit_camera(scene.list_points(), np.array(VIEWS["Oblique"]), math.radians(45.0), 1.5)
+    camera = SimpleNamespace(
+        position=position,
+        look_at=look_at,
+        up_direction=np.array((0.0, 0.0, 1.0)),
+        fov=math.radians(45.0),
+        image_width=1200,
+        image_height=800,
+    )
+    scene.show_labels(NameLabels.FRAMES, ("Raptor:CG",), camera)
+    shown = [each for each in scene._labels if each.handle.visible]
+    assert 5 < len(shown) < len([each for each in scene._labels if each.kind is NameLabels.FRAMES])
+    assert "Raptor:CG" in {each.text for each in shown}
+    frames = {each.text: each for each in scene._labels if each.kind is NameLabels.FRAMES}
+    places = np.array([scene.get_frame_pose(each.text).xyz for each in shown])  # type: ignore[union-attr]
+    pixels, depths = project(places, camera)
+    assert len(frames) > len(shown)
+    assert ((pixels > 0) & (pixels < (1200, 800))).all()
+    assert depths.min() > 0.0
+    for number, pixel in enumerate(pixels):
+        for other, place in enumerate(pixels[:number]):
+            width = 0.5 * LABEL_PX[0] * (len(shown[number].text) + len(shown[other].text) + 2)
+            assert abs(pixel[0] - place[0]) >= width or abs(pixel[1] - place[1]) >= LABEL_PX[1]
+    # what is looked at is in the middle of the picture, and what is behind has no place in it
+    assert project(np.array([look_at]), camera)[0][0] == pytest.approx((600.0, 400.0))
+    assert np.isnan(project(np.array([2 * position - look_at]), camera)[0]).all()
+
+
 def test_given_a_covariance_then_its_ellipsoid_holds_the_stated_share_of_its_errors() -> None:
     generator = np.random.default_rng(1)
     root = generator.normal(size=(3, 3))
@@ -407,7 +447,7 @@ def test_given_quotes_in_names_then_what_is_copied_is_python_shell_and_yaml() ->
 def test_given_two_frames_that_are_queried_then_their_names_are_in_the_scene(page: Page) -> None:
     scene = make_scene(page, open_geometry(find_vehicle_file(), {}))
     scene.show_labels(NameLabels.BODIES, ("Raptor:CG", "FLEA:Lens"))
-    shown = {text for kind, text, label in scene._labels if label.visible and kind is NameLabels.FRAMES}
+    shown = {each.text for each in scene._labels if each.handle.visible and each.kind is NameLabels.FRAMES}
     assert shown == {"Raptor:CG", "FLEA:Lens"}
 
 

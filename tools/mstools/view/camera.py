@@ -19,6 +19,7 @@ from functools import partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import viser
 
 from modelserver.transforms.so3 import Array, Vector3
@@ -86,6 +87,35 @@ def fit_camera(points: Array, direction: Array, fov: float, aspect: float) -> Ca
     return CameraPose(center + max(MARGIN * distance, MIN_DISTANCE) * back, center)
 
 
+def project(points: Array, camera: Any) -> tuple[Array, Array]:
+    """Return where a browser's camera sees points (n, 3) of the scene: pixels (n, 2) from the upper left, and depths.
+
+    A point behind the camera has a depth that is not positive, and no pixel.
+    """
+    forward = camera.look_at - camera.position
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, camera.up_direction)
+    right = right / np.linalg.norm(right)
+    offsets = points - camera.position
+    depths = offsets @ forward
+    focal = 0.5 * camera.image_height / math.tan(0.5 * camera.fov)
+    seen = np.where(depths > 0.0, depths, math.nan)
+    x = 0.5 * camera.image_width + focal * (offsets @ right) / seen
+    y = 0.5 * camera.image_height - focal * (offsets @ np.cross(right, forward)) / seen
+    return np.column_stack([x, y]), depths
+
+
+def choose_labels(pixels: Array, depths: Array, widths: Array, height: float) -> npt.NDArray[np.bool_]:
+    """Return which labels are shown so that none covers another: the nearest first. Sizes are in pixels."""
+    shown = np.zeros(len(pixels), bool)
+    for number in np.argsort(depths):
+        if not np.isfinite(pixels[number]).all():
+            continue
+        dx, dy = np.abs(pixels[shown] - pixels[number]).T
+        shown[number] = not np.any((dx < 0.5 * (widths[shown] + widths[number])) & (dy < height))
+    return shown
+
+
 class ViewCamera:
     """The cameras of all browsers.
 
@@ -135,6 +165,11 @@ class ViewCamera:
             # a browser that was connected before, or whose link states a place, has another one
             if self._fitted and any(at.is_near(each) for each in self._initial):
                 self._fit(client, at.position - at.look_at)
+
+    def find_latest(self) -> Any:
+        """Return the camera that was moved last, None without a browser."""
+        cameras = [client.camera for client in self._server.get_clients().values()]
+        return max(cameras, key=lambda each: each.update_timestamp, default=None)
 
     def move(self, offset: Array) -> None:
         """Move all cameras, so that the picture stays where the whole scene moves."""

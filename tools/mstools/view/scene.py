@@ -19,7 +19,7 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from enum import StrEnum
 from itertools import pairwise, product
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +34,7 @@ from modelserver.geometry.parts import Body, Shape, ShapeKind
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
 from mstools.recordings.drive import FramePoses, Picture
+from mstools.view.camera import choose_labels, project
 from mstools.view.meshes import MeshError, MeshFolders
 
 MAX_TRAIL_POINTS: Final = 4_000
@@ -58,6 +59,9 @@ FIX_COLORS: Final = np.array([VALID_COLOR, INVALID_COLOR, (240, 190, 60), FIXED_
 
 CHI_SQUARE_3: Final = {50: 2.366, 68: 3.527, 95: 7.815, 99: 11.345}
 """Quantiles of chi-square with three degrees of freedom by confidence in percent (NIST e-Handbook, 1.3.6.7.4)."""
+
+LABEL_PX: Final = (6.0, 16.0)
+"""Width of a label's character and height of a label in pixels, as viser draws them (measured on a screenshot)."""
 
 GRID_LABELS: Final = 1
 """Labeled grid crossings on each side of the vehicle, at `LABEL_SPACING`."""
@@ -112,6 +116,16 @@ class NameLabels(StrEnum):
     FRAMES = "frames"
 
 
+class NodeLabel(NamedTuple):
+    """The name of a body or a frame, at a place on a body."""
+
+    kind: NameLabels
+    text: str
+    body: str
+    place: Vector3
+    handle: viser.LabelHandle
+
+
 class VehicleScene:
     """Draw one model and its pictures.
 
@@ -128,7 +142,7 @@ class VehicleScene:
         self._bodies: dict[str, viser.SceneNodeHandle] = {}
         self._frames: FramePoses | None = None
         self._poses: dict[str, Pose] = {}
-        self._labels: list[tuple[NameLabels, str, viser.LabelHandle]] = []
+        self._labels: list[NodeLabel] = []
         self._path: tuple[str, ...] = ()
         self._labeled: tuple[int, int, Origin] | None = None
         self._size = 1.0
@@ -230,9 +244,13 @@ class VehicleScene:
     def list_points(self) -> Array:
         """Return the outermost points (n, 3) of shapes and frames in the scene, as they are drawn."""
         found = [pose.transform(self._points[name]) for name, pose in self._poses.items()]
-        points = np.concatenate([np.zeros((0, 3)), *found])
+        return self._to_scene(np.concatenate([np.zeros((0, 3)), *found]))
+
+    def _to_scene(self, points: Array) -> Array:
+        """Return points (n, 3) of the base frame in the scene."""
         vehicle = Pose(self._vehicle.position.tolist(), self._vehicle.wxyz.tolist())
-        return vehicle.transform(points) + self._world.position
+        found: Array = vehicle.transform(points) + self._world.position
+        return found
 
     @property
     def center(self) -> Array:
@@ -262,7 +280,7 @@ class VehicleScene:
         places = np.array([frame.pose.xyz for frame in body]).reshape(-1, 3)
         self._points[body.name] = np.concatenate([places, *points])
         self._solid[body.name] = np.concatenate([np.zeros((0, 3)), *solid])
-        self._add_label(NameLabels.BODIES, f"{root}/name", body.name, (0.0, 0.0, 0.0))
+        self._add_label(NameLabels.BODIES, f"{root}/name", body.name, body.name, (0.0, 0.0, 0.0))
         if not body.frames:
             return
         axes = self._scene.add_batched_axes(
@@ -274,13 +292,13 @@ class VehicleScene:
         )
         self._add_pick(axes, lambda event: body.frames[event.instance_index or 0].full_name)
         for number, frame in enumerate(body.frames):
-            self._add_label(NameLabels.FRAMES, f"{root}/names/{number}", frame.full_name, frame.pose.xyz)
+            self._add_label(NameLabels.FRAMES, f"{root}/names/{number}", frame.full_name, body.name, frame.pose.xyz)
 
-    def _add_label(self, kind: NameLabels, node: str, text: str, place: Vector3) -> None:
+    def _add_label(self, kind: NameLabels, node: str, text: str, body: str, place: Vector3) -> None:
         label = self._scene.add_label(
             node, text, position=place, visible=False, font_screen_scale=0.8, anchor="bottom-center"
         )
-        self._labels.append((kind, text, label))
+        self._labels.append(NodeLabel(kind, text, body, place, label))
 
     def _add_pick(self, node: Any, find_frame: Callable[[Any], str]) -> None:
         node.on_click(lambda event: self._pick(find_frame(event), False))
@@ -325,10 +343,24 @@ class VehicleScene:
         x, y, z = shape.size
         return scene.add_glb(name, mesh.glb, scale=(x, y, z), **place)
 
-    def show_labels(self, shown: NameLabels, chosen: Collection[str] = ()) -> None:
-        """Show the names of bodies or frames, and those of some frames in any case."""
-        for kind, text, label in self._labels:
-            label.visible = kind == shown or (kind is NameLabels.FRAMES and text in chosen)
+    def show_labels(self, shown: NameLabels, chosen: Collection[str], camera: Any = None) -> None:
+        """Show the names of bodies or frames, and those of some frames in any case.
+
+        Those that would cover another one in the picture of a camera are left out, the nearest come first.
+        """
+        is_chosen = np.array([each.kind is NameLabels.FRAMES and each.text in chosen for each in self._labels], bool)
+        wanted = is_chosen | np.array([each.kind is shown for each in self._labels], bool)
+        if camera is not None and self._labels:
+            # a body without frames is drawn at the base frame
+            bodies = [self._poses.get(each.body, Pose.identity()) for each in self._labels]
+            places = [body.transform(each.place) for body, each in zip(bodies, self._labels, strict=True)]
+            pixels, depths = project(self._to_scene(np.array(places)), camera)
+            pixels[~wanted] = math.nan
+            widths = np.array([LABEL_PX[0] * (len(each.text) + 1) for each in self._labels])
+            wanted = choose_labels(pixels, np.where(is_chosen, 0.0, depths), widths, LABEL_PX[1])
+        for each, is_visible in zip(self._labels, wanted.tolist(), strict=True):
+            if each.handle.visible != is_visible:
+                each.handle.visible = is_visible
 
     # --- pictures
 

@@ -52,6 +52,9 @@ PICTURE_S: Final = 1.0 / 30.0
 SLIDER_PERIOD_S: Final = 0.2
 """Period at which slider and clock follow playback, seconds."""
 
+LABEL_PERIOD_S: Final = 0.2
+"""Period at which it is decided which names are shown, seconds."""
+
 FIX_PERIOD_S: Final = 0.5
 """Period at which the fixes follow, seconds: all of them are sent to the browser again."""
 
@@ -66,7 +69,7 @@ class Viewer:
         self._model: Model | None = None
         self._is_following = True
         self._named: tuple[NameLabels, tuple[str, str]] | None = None
-        self._next_slider = self._next_state = self._next_fixes = 0.0
+        self._next_slider = self._next_state = self._next_fixes = self._next_labels = 0.0
         gui = page.server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         gui.main_panel.dock_right()
@@ -157,9 +160,10 @@ class Viewer:
             is_loaded = model is not None and model is not self._model
             if model is not None and is_loaded:
                 self._set_model(model, base_frame)
-            if (named := (NameLabels(display.labels.value), self._query.frames)) != self._named:
-                self._named = named
-                self._scene.show_labels(*named)
+            named = (NameLabels(display.labels.value), self._query.frames)
+            if named != self._named or now >= self._next_labels:
+                self._named, self._next_labels = named, now + LABEL_PERIOD_S
+                self._scene.show_labels(*named, self._camera.find_latest())
             center, is_following = self._scene.center, display.follow.value
             self._scene.show(picture, is_following)
             if is_following != self._is_following:

@@ -303,7 +303,7 @@ find("slider").addEventListener("input", () => { isSliding = true; seek(find("sl
 find("slider").addEventListener("change", () => { isSliding = false; });
 document.addEventListener("keydown", (event) => {
   if (event.target.matches("input, select, textarea") || event.ctrlKey || event.metaKey || event.altKey) return;
-  const pane = { 1: "scene", 2: "map", 3: "plots" }[event.key];
+  const pane = { s: "scene", m: "map", p: "plots" }[event.key];
   if (pane) togglePane(pane);
   else if (event.key === " " && state?.has_time) find("play").click();
   else if (event.key === "ArrowLeft" && state?.has_time) seek(state.at - (event.shiftKey ? 10 : 1));
