@@ -146,7 +146,7 @@ def take_page(
 ) -> None:
     """Write the screenshot of the whole page at a time of a drive, after some seconds."""
     with start_browser() as browser, show(browser, source, sharpness=1.0, path="") as page:
-        close_warning(page.frame_locator("#scene"))
+        close_warning(page.frame_locator("#scene iframe"))
         for pane in ("scene", "map"):
             if (page.locator(f"[data-pane={pane}]").get_attribute("aria-pressed") == "true") != (pane in panes):
                 page.locator(f"[data-pane={pane}]").click()

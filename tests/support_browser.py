@@ -125,7 +125,7 @@ def serve(
     thread.start()
     try:
         with open_link(browser, f"{served.link}{path}", sharpness) as page:
-            (page if path else page.frame_locator("#scene")).get_by_role("tab", name="Query").wait_for()
+            (page if path else page.frame_locator("#scene iframe")).get_by_role("tab", name="Query").wait_for()
             yield page, served.server
     finally:
         stop.set()

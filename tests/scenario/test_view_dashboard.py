@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.slow, needs_browser]
 
 AT = 20.0
+ONE_FRAME = "modelserver: geometry/1\nbodies:\n  Mast: {frames: {Top: {}}}\n"
 PHONE = {"width": 390, "height": 800}
 
 
@@ -147,6 +148,26 @@ def test_given_a_geometry_file_then_the_scene_is_alone(browser: Browser) -> None
         assert len(page.locator("#revision").inner_text()) == 16
 
 
+def test_given_a_pointer_at_a_frame_then_its_name_and_pose_are_shown(browser: Browser, tmp_path: Path) -> None:
+    path = tmp_path / "geometry.yaml"
+    path.write_text(ONE_FRAME)
+    with show(browser, open_geometry(path, {}), path="") as page:
+        canvas = page.frame_locator("#scene iframe").locator("canvas").first
+        box = canvas.bounding_box()
+        assert box is not None
+        hover = page.locator("#hover")
+        for _ in range(60):
+            # the only frame is in the middle, where the camera looks once it has fitted the scene
+            page.mouse.move(box["x"] + box["width"] / 2 + 3, box["y"] + box["height"] / 2 + 3)
+            page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+            page.wait_for_timeout(200)
+            if hover.is_visible():
+                break
+        assert hover.inner_text().split("\n") == ["Mast:Top", "0.000, 0.000, 0.000 m; 0.0, 0.0, 0.0 deg"]
+        page.mouse.move(box["x"] + 30, box["y"] + box["height"] - 30)
+        hover.wait_for(state="hidden")
+
+
 def test_given_a_viewer_that_ends_then_the_page_reports_it_and_returns_with_the_next(
     browser: Browser, drive_log: Path
 ) -> None:
@@ -169,8 +190,8 @@ def test_given_a_link_with_a_token_then_page_and_scene_open_and_without_it_neith
     Viewer(served, open_geometry(find_vehicle_file(), {}))
     try:
         with open_link(browser, served.link) as page:
-            page.frame_locator("#scene").get_by_role("tab", name="Query").wait_for()
-            assert "token" not in page.frame_locator("#scene").locator("html").evaluate("() => location.href")
+            page.frame_locator("#scene iframe").get_by_role("tab", name="Query").wait_for()
+            assert "token" not in page.frame_locator("#scene iframe").locator("html").evaluate("() => location.href")
         with open_link(browser, served.link.partition("?")[0], expected_errors=("403",)) as page:
             page.get_by_text("the token is missing or wrong").wait_for()
     finally:

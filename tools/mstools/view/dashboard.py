@@ -4,6 +4,7 @@
     /state          the strip: validity, speed, heading, uncertainty, ages, time
     /charts         the charts of a span of time; /strip the validity over it
     /map            what a view of the map shows; /tile an image below it
+    /hover          the frame below the pointer in the scene
     /seek, /play, /pause, /live   change the time that is shown
     /assets/NAME    scripts and styles
 
@@ -26,6 +27,7 @@ from typing import Any, Final
 import numpy as np
 
 from modelserver.messages import Health
+from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
 from mstools.recordings.drive import Drive, Picture
 from mstools.report.charts import encode_figure, read_plotly
@@ -75,6 +77,7 @@ class Dashboard:
     seek : called with seconds after the drive's begin
     play : called with whether it is to play
     follow : called to show the newest picture
+    find_frame : returns the frame below the pointer of a browser and its pose in the base frame; None without one
     """
 
     def __init__(
@@ -83,9 +86,10 @@ class Dashboard:
         seek: Callable[[float], None],
         play: Callable[[bool], None],
         follow: Callable[[], None],
+        find_frame: Callable[[str, float, float], tuple[str, Pose] | None],
     ):
         self._source = source
-        self._seek, self._play, self._follow = seek, play, follow
+        self._seek, self._play, self._follow, self._find_frame = seek, play, follow, find_frame
         self.shown = Shown()
 
     def respond(self, path: str, query: Mapping[str, str]) -> Reply | None:
@@ -177,11 +181,23 @@ class Dashboard:
         self._follow()
         return b"{}"
 
+    def _describe_frame(self, query: Mapping[str, str]) -> bytes:
+        x, y = (_read_number(query, name, 0.0, 1.0) for name in ("x", "y"))
+        found = self._find_frame(query.get("browser", ""), x, y)
+        if found is None:
+            return _encode({"name": ""})
+        name, pose = found
+        xyz, rpy = ([value + 0.0 for value in each] for each in (pose.xyz, map(math.degrees, pose.rpy)))
+        place = ", ".join(f"{value:.3f}" for value in xyz)
+        angles = ", ".join(f"{value:.1f}" for value in rpy)
+        return _encode({"name": name, "pose": f"{place} m; {angles} deg"})
+
     _answers: Final[Mapping[str, Callable[[Dashboard, Mapping[str, str]], bytes]]] = {
         "/state": _describe_state,
         "/charts": _make_charts,
         "/strip": _make_strip,
         "/map": _describe_map,
+        "/hover": _describe_frame,
         "/seek": _change_time,
         "/play": _change_play,
         "/live": _change_live,

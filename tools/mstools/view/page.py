@@ -27,6 +27,7 @@ import secrets
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout, suppress
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from functools import partial
 from http.cookies import CookieError, SimpleCookie
@@ -47,7 +48,10 @@ LOOPBACK_NAMES: Final = ("127.0.0.1", "localhost", "[::1]")
 COOKIE: Final = "modelserver_view"
 TOKEN_BYTES: Final = 24
 SCENE: Final = "/scene"
-"""Path of viser's page."""
+"""Path of viser's page, or of one of them: /scene/DENSITY/NAME, with the pixels of the screen per pixel of the page."""
+
+_PATH: Final[ContextVar[str]] = ContextVar("path", default=SCENE)
+"""The path of the websocket within its tasks."""
 
 
 class Reply(NamedTuple):
@@ -111,7 +115,7 @@ class Guard:
         url = urlsplit(request.path)
         if request.headers.get("Upgrade") == "websocket":
             return inner(connection, request)
-        if url.path == SCENE:
+        if f"{url.path}/".startswith(f"{SCENE}/"):
             response = inner(connection, replace(request, path="/"))
         else:
             query = {name: values[-1] for name, values in parse_qs(url.query).items()}
@@ -182,7 +186,33 @@ def format_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 class PageServer(viser.ViserServer):
-    """viser's server without its tunnel to a public server."""
+    """viser's server without its tunnel to a public server. It knows at which path each browser opened the scene."""
+
+    def __init__(self, host: str, port: int):
+        self._paths: dict[int, str] = {}
+        super().__init__(host=host, port=port, label="ModelServer", verbose=False)
+
+        async def add(client: viser.ClientHandle) -> None:
+            self._paths[client.client_id] = _PATH.get()
+
+        async def remove(client: viser.ClientHandle) -> None:
+            self._paths.pop(client.client_id, None)
+
+        self.on_client_connect(add)
+        self.on_client_disconnect(remove)
+
+    def find_client(self, name: str) -> viser.ClientHandle | None:
+        """Return the browser that opened the scene at /scene/DENSITY/NAME; None without one."""
+        clients = self.get_clients()
+        found = [number for number, path in list(self._paths.items()) if path.rpartition("/")[2] == name]
+        return clients.get(found[-1]) if found else None
+
+    def get_density(self, client: viser.ClientHandle) -> float:
+        """Return the pixels of a browser's screen per pixel of its page, 1 where it did not state it."""
+        parts = self._paths.get(client.client_id, "").split("/")
+        with suppress(ValueError, IndexError):
+            return min(max(float(parts[2]), 0.25), 8.0)
+        return 1.0
 
     def request_share_url(self, verbose: bool = True) -> None:
         """Do nothing: what a vehicle does is not published."""
@@ -227,7 +257,7 @@ def open_page(address: str = "127.0.0.1", port: int = 8080, *, with_token: bool 
     # its own messages on stdout are replaced by the link
     serve = partial(_serve, guard, bound, respond)
     with redirect_stdout(StringIO()), patch.object(websockets.asyncio.server, "serve", serve):
-        server = PageServer(host=address, port=port, label="ModelServer", verbose=False)
+        server = PageServer(address, port)
     pages.append(Page(server, f"http://{reached}:{port}/" + (f"?token={token}" if token else "")))
     return pages[0]
 
@@ -261,4 +291,10 @@ _SERVE: Final = websockets.asyncio.server.serve
 def _serve(guard: Guard, bound: socket.socket, respond: Any, handler: Any, host: str, port: int, **options: Any) -> Any:
     """Serve as viser asks for, with the guard before its own handler, on a socket that is bound already."""
     inner = options.pop("process_request")
-    return _SERVE(handler, sock=bound, process_request=partial(guard.process, inner, respond), **options)
+
+    async def handle(connection: ServerConnection) -> None:
+        assert connection.request is not None
+        _PATH.set(urlsplit(connection.request.path).path)
+        await handler(connection)
+
+    return _SERVE(handle, sock=bound, process_request=partial(guard.process, inner, respond), **options)

@@ -343,10 +343,11 @@ class VehicleScene:
         x, y, z = shape.size
         return scene.add_glb(name, mesh.glb, scale=(x, y, z), **place)
 
-    def show_labels(self, shown: NameLabels, chosen: Collection[str], camera: Any = None) -> None:
+    def show_labels(self, shown: NameLabels, chosen: Collection[str], camera: Any = None, density: float = 1.0) -> None:
         """Show the names of bodies or frames, and those of some frames in any case.
 
-        Those that would cover another one in the picture of a camera are left out, the nearest come first.
+        Those that would cover another one in the picture of a camera are left out, the nearest come first. `density`:
+        pixels of the camera per pixel of its page.
         """
         is_chosen = np.array([each.kind is NameLabels.FRAMES and each.text in chosen for each in self._labels], bool)
         wanted = is_chosen | np.array([each.kind is shown for each in self._labels], bool)
@@ -357,10 +358,28 @@ class VehicleScene:
             pixels, depths = project(self._to_scene(np.array(places)), camera)
             pixels[~wanted] = math.nan
             widths = np.array([LABEL_PX[0] * (len(each.text) + 1) for each in self._labels])
-            wanted = choose_labels(pixels, np.where(is_chosen, 0.0, depths), widths, LABEL_PX[1])
+            wanted = choose_labels(pixels / density, np.where(is_chosen, 0.0, depths), widths, LABEL_PX[1])
         for each, is_visible in zip(self._labels, wanted.tolist(), strict=True):
             if each.handle.visible != is_visible:
                 each.handle.visible = is_visible
+
+    def find_frame(self, camera: Any, x: float, y: float, distance: float) -> tuple[str, Pose] | None:
+        """Return the frame at a place of a camera's picture, and its pose in the base frame; None where there is none.
+
+        `x` and `y` are parts of the picture's width and height from the upper left, `distance` is the greatest one of
+        the frame from there, a part of the height. Of several the nearest to the camera is returned.
+        """
+        if self._frames is None:
+            return None
+        poses = self._frames.compute_frames(self._poses)
+        if not poses:
+            return None
+        pixels, depths = project(self._to_scene(np.array([each.xyz for each in poses.values()])), camera)
+        pointer = np.array((x * camera.image_width, y * camera.image_height))
+        is_near = np.linalg.norm(pixels - pointer, axis=1) <= distance * camera.image_height
+        if not is_near.any():
+            return None
+        return list(poses.items())[int(np.argmin(np.where(is_near, depths, math.inf)))]
 
     # --- pictures
 

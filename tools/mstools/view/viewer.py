@@ -21,6 +21,7 @@ from modelserver.geometry import names
 from modelserver.geometry.joint import Joint
 from modelserver.geometry.model import Model
 from modelserver.messages import Explanation, Health, Invalid, MotionAnswer, Policy, PoseAnswer, Quality
+from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array
 from mstools.edit import GeometryItem, ItemKind
 from mstools.recordings.drive import Drive, DriveEvent, EventKind, Picture
@@ -51,6 +52,12 @@ PICTURE_S: Final = 1.0 / 30.0
 
 SLIDER_PERIOD_S: Final = 0.2
 """Period at which slider and clock follow playback, seconds."""
+
+HOVER_S: Final = 0.5
+"""Longest time to find the frame below a pointer, seconds: a later answer would be of where it was."""
+
+HOVER_DISTANCE: Final = 0.03
+"""Distance of the pointer from a frame whose name is shown, as a part of the picture's height: half of its axes."""
 
 LABEL_PERIOD_S: Final = 0.2
 """Period at which it is decided which names are shown, seconds."""
@@ -105,8 +112,24 @@ class Viewer:
             seek=lambda at: self._change_time(lambda panel: panel.jump(at)),
             play=lambda on: self._change_time(lambda panel: panel.play(on)),
             follow=lambda: self._change_time(lambda panel: panel.follow()),
+            find_frame=self._find_frame,
         )
         page.respond = self._dashboard.respond
+
+    def _find_frame(self, browser: str, x: float, y: float) -> tuple[str, Pose] | None:
+        """Return the frame below the pointer of a browser, as found between two pictures; None within `HOVER_S`."""
+        found: Future[tuple[str, Pose] | None] = Future()
+
+        def find() -> None:
+            client = self._server.find_client(browser)
+            frame = None if client is None else self._scene.find_frame(client.camera, x, y, HOVER_DISTANCE)
+            found.set_result(frame)
+
+        self._actions.put(find)
+        try:
+            return found.result(HOVER_S)
+        except TimeoutError:
+            return None
 
     def _change_time(self, change: Callable[[TimePanel], object]) -> None:
         if self._time is not None:
@@ -163,7 +186,9 @@ class Viewer:
             named = (NameLabels(display.labels.value), self._query.frames)
             if named != self._named or now >= self._next_labels:
                 self._named, self._next_labels = named, now + LABEL_PERIOD_S
-                self._scene.show_labels(*named, self._camera.find_latest())
+                latest = self._camera.find_latest()
+                density = 1.0 if latest is None else self._server.get_density(latest.client)
+                self._scene.show_labels(*named, latest, density)
             center, is_following = self._scene.center, display.follow.value
             self._scene.show(picture, is_following)
             if is_following != self._is_following:

@@ -8,6 +8,10 @@ const IDLE_MS = 1000;
 const LIVE_SPAN_S = 120;
 const DEFAULT_CHARTS = ["speed", "heading", "uncertainty", "innovations"];
 
+// names this page's scene among those of others
+const BROWSER = Math.random().toString(36).slice(2);
+const frame = find("scene").querySelector("iframe");
+
 let state = null;
 let isGone = false;
 
@@ -36,7 +40,7 @@ function setTheme(theme) {
   const query = new URLSearchParams(location.search);
   query.delete("token");
   if (theme === "dark") query.set("darkMode", "1");
-  find("scene").src = `/scene?${query}`;
+  frame.src = `/scene/${query.get("fixedDpr") ?? devicePixelRatio}/${BROWSER}?${query}`;
   colorCharts();
   map.paint();
 }
@@ -94,6 +98,40 @@ function showStrip() {
   setText(find("revision"), state.revision);
   find("revision").title = `Revision of the geometry: ${state.revision}`;
 }
+
+// --- the frame below the pointer
+
+let hovered = null;
+let isHovering = false;
+
+async function showHover() {
+  if (isHovering || !hovered) return;
+  isHovering = true;
+  const asked = hovered;
+  const { width, height } = asked.target.getBoundingClientRect();
+  const [x, y] = [asked.offsetX / width, asked.offsetY / height];
+  const found = await fetchJson(`/hover?${new URLSearchParams({ browser: BROWSER, x, y })}`).catch(() => ({ name: "" }));
+  isHovering = false;
+  const box = find("hover");
+  box.hidden = !found.name || hovered === null;
+  if (found.name) {
+    setText(box.firstElementChild, found.name);
+    setText(box.lastElementChild, found.pose);
+    box.style.left = `${Math.min(asked.clientX + 14, width - 60)}px`;
+    box.style.top = `${asked.clientY + 14}px`;
+  }
+  if (hovered !== asked) showHover();
+}
+
+frame.addEventListener("load", () => {
+  frame.contentDocument.addEventListener("pointermove", (event) => {
+    // a drag turns the view
+    hovered = event.target.tagName === "CANVAS" && !event.buttons ? event : null;
+    if (!hovered) find("hover").hidden = true;
+    else showHover();
+  });
+});
+find("scene").addEventListener("pointerleave", () => { hovered = null; find("hover").hidden = true; });
 
 // --- panes
 
@@ -275,7 +313,7 @@ async function poll() {
     if (isGone) {
       isGone = false;
       find("gone").hidden = true;
-      find("scene").src = find("scene").src;
+      frame.src = frame.src;
     }
   } catch (error) {
     isGone = true;
