@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from support_browser import needs_browser, open_link, show
+from support_browser import needs_browser, open_link, serve, show
 from support_view import record_drive
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install -e '.[view]'")
@@ -166,6 +166,29 @@ def test_given_a_pointer_at_a_frame_then_its_name_and_pose_are_shown(browser: Br
         assert hover.inner_text().split("\n") == ["Mast:Top", "0.000, 0.000, 0.000 m; 0.0, 0.0, 0.0 deg"]
         page.mouse.move(box["x"] + 30, box["y"] + box["height"] - 30)
         hover.wait_for(state="hidden")
+
+
+def test_given_the_tree_then_a_search_finds_frames_a_click_asks_for_one_and_bodies_are_hidden(browser: Browser) -> None:
+    with serve(browser, open_geometry(find_vehicle_file(), {}), path="") as (page, server):
+        page.get_by_role("button", name="Tree").click()
+        tree = page.get_by_label("Bodies and frames", exact=True)
+        tree.get_by_label("Search").fill("lens")
+        found = [each.get_attribute("data-frame") for each in tree.locator("button:visible").all()]
+        assert found
+        assert all("lens" in (each or "").lower() for each in found)
+        tree.locator("button:visible").first.click()
+        frame = page.frame_locator("#scene iframe").get_by_role("combobox", name="Frame", exact=True)
+        page.wait_for_timeout(1000)
+        assert frame.input_value() == found[0]
+        tree.get_by_label("Search").fill("")
+        node = server.scene.get_handle_by_name("/world/vehicle/body/0")
+        assert node is not None
+        assert node.visible
+        tree.locator("ul input").first.uncheck()
+        tree.get_by_label("grid").uncheck()
+        page.wait_for_timeout(1000)
+        assert not node.visible
+        assert not server.scene.get_handle_by_name("/world/grid").visible  # type: ignore[union-attr]
 
 
 def test_given_a_viewer_that_ends_then_the_page_reports_it_and_returns_with_the_next(

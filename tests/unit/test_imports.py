@@ -32,7 +32,7 @@ TOOLS = {
     "tuning": {"terminal", "report"},
     "launch": {"terminal"},
     "deployment": {"terminal"},
-    "view": {"terminal", "edit", "recordings"},
+    "view": {"terminal", "edit", "recordings", "report"},
 }
 SERVER = CORE | WIRE | CONFIG | FILES | SIGNING | {"core", "formats", "yaml_tree"}
 BELOW_TOOLS = SERVER | DRIVERS | {"server", "client", "simulation", "msdrivers", "extras"}

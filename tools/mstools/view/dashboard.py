@@ -5,6 +5,7 @@
     /charts         the charts of a span of time; /strip the validity over it
     /map            what a view of the map shows; /tile an image below it
     /hover          the frame below the pointer in the scene
+    /tree           bodies with their frames, and what is hidden; /hide, /pick change that and the query
     /seek, /play, /pause, /live   change the time that is shown
     /assets/NAME    scripts and styles
 
@@ -33,6 +34,7 @@ from mstools.recordings.drive import Drive, Picture
 from mstools.report.charts import encode_figure, read_plotly
 from mstools.view.map import View, describe_map, fit_view
 from mstools.view.page import Reply
+from mstools.view.scene import KINDS
 from mstools.view.signals import (
     Span,
     compute_headings,
@@ -77,6 +79,8 @@ class Dashboard:
     seek : called with seconds after the drive's begin
     play : called with whether it is to play
     follow : called to show the newest picture
+    hide : called with the names of bodies and the kinds of things that are not to be drawn
+    pick : called with a frame for the query, and whether it is its frame of reference
     find_frame : returns the frame below the pointer of a browser and its pose in the base frame; None without one
     """
 
@@ -87,9 +91,13 @@ class Dashboard:
         play: Callable[[bool], None],
         follow: Callable[[], None],
         find_frame: Callable[[str, float, float], tuple[str, Pose] | None],
+        hide: Callable[[frozenset[str], frozenset[str]], None],
+        pick: Callable[[str, bool], None],
     ):
         self._source = source
         self._seek, self._play, self._follow, self._find_frame = seek, play, follow, find_frame
+        self._hide, self._pick = hide, pick
+        self._hidden: tuple[frozenset[str], frozenset[str]] = (frozenset(), frozenset())
         self.shown = Shown()
 
     def respond(self, path: str, query: Mapping[str, str]) -> Reply | None:
@@ -192,12 +200,40 @@ class Dashboard:
         angles = ", ".join(f"{value:.1f}" for value in rpy)
         return _encode({"name": name, "pose": f"{place} m; {angles} deg"})
 
+    def _describe_tree(self, query: Mapping[str, str]) -> bytes:
+        with self._source.lock:
+            model, _ = self._source.drive.get_geometry(self.shown.utime)
+        bodies, kinds = self._hidden
+        listed = [] if model is None else model.bodies
+        return _encode(
+            {
+                "bodies": [
+                    {"name": body.name, "shown": body.name not in bodies, "frames": [each.full_name for each in body]}
+                    for body in listed
+                ],
+                "kinds": [{"name": kind, "shown": kind not in kinds} for kind in KINDS],
+            }
+        )
+
+    def _change_hidden(self, query: Mapping[str, str]) -> bytes:
+        bodies, kinds = (_read_names(query, name) for name in ("bodies", "kinds"))
+        self._hidden = (bodies, kinds)
+        self._hide(bodies, kinds)
+        return b"{}"
+
+    def _change_query(self, query: Mapping[str, str]) -> bytes:
+        self._pick(query.get("frame", ""), query.get("reference") == "1")
+        return b"{}"
+
     _answers: Final[Mapping[str, Callable[[Dashboard, Mapping[str, str]], bytes]]] = {
         "/state": _describe_state,
         "/charts": _make_charts,
         "/strip": _make_strip,
         "/map": _describe_map,
         "/hover": _describe_frame,
+        "/tree": _describe_tree,
+        "/hide": _change_hidden,
+        "/pick": _change_query,
         "/seek": _change_time,
         "/play": _change_play,
         "/live": _change_live,
@@ -245,3 +281,10 @@ def _read_number(query: Mapping[str, str], name: str, low: float, high: float) -
     if not low <= value <= high:
         raise ValueError(f"{name} must be a number from {low:g} to {high:g}")
     return value
+
+
+def _read_names(query: Mapping[str, str], name: str) -> frozenset[str]:
+    value = json.loads(query.get(name, "[]"))
+    if not (isinstance(value, list) and all(isinstance(each, str) for each in value)):
+        raise ValueError(f"{name} must be a list of names in JSON")
+    return frozenset(value)

@@ -108,6 +108,10 @@ _CUBE: Final = np.array(
 """The 12 edges of the unit cube (12, 2, 3), corners at 0 and 1."""
 
 
+KINDS: Final = ("shapes", "axes", "constraints", "grid", "track", "fixes")
+"""What can be hidden."""
+
+
 class NameLabels(StrEnum):
     """Which names stand in the scene."""
 
@@ -168,8 +172,14 @@ class VehicleScene:
             fade_strength=4.0,
         )
         self.set_shadows(False)
-        self._trail = self._add_lines("/world/trail", TRAIL_COLOR, 3.0)
-        self._trail_end = self._add_lines("/world/trail_end", TRAIL_COLOR, 3.0)
+        groups = {"track": "/world/track", "fixes": "/world/sensors", "constraints": "/world/vehicle/edges"}
+        self._groups: dict[str, list[viser.SceneNodeHandle]] = {
+            "grid": [self._grid],
+            **{kind: [self._scene.add_frame(node, show_axes=False)] for kind, node in groups.items()},
+        }
+        self._hidden: tuple[frozenset[str], frozenset[str]] = (frozenset(), frozenset())
+        self._trail = self._add_lines("/world/track/trail", TRAIL_COLOR, 3.0)
+        self._trail_end = self._add_lines("/world/track/end", TRAIL_COLOR, 3.0)
         self._trail_span = (0, 0)
         # placed by their positions: a browser moves nodes at once, but draws other lines some pictures later
         self._level = self._scene.add_frame("/world/protection_level", show_axes=False, visible=False)
@@ -185,7 +195,7 @@ class VehicleScene:
         )
         self._path_lines = self._add_lines("/world/vehicle/path", PATH_COLOR, 5.0)
         self._fixes = self._scene.add_point_cloud(
-            "/world/fixes",
+            "/world/sensors/fixes",
             np.zeros((1, 3), np.float32),
             np.zeros((1, 3), np.uint8),
             visible=False,
@@ -223,6 +233,7 @@ class VehicleScene:
         # went with its body
         self._gizmo = self._mark = None
         self._bodies, self._poses, self._labels, self._points, self._solid, self.unread = {}, {}, [], {}, {}, {}
+        self._groups |= {"shapes": [], "axes": []}
         self._frames = FramePoses(model, base_frame)
         # the largest extent of a body's frames
         size = self._size = max([0.5, *(float(np.ptp(_list_corners(body), axis=0).max()) for body in model.bodies)])
@@ -238,6 +249,7 @@ class VehicleScene:
                 node.position = self._poses[body.name].xyz
             self._draw_body(root, body, size)
         self._place_bodies(self._frames, self._frames.compute_bodies())
+        self.hide(*self._hidden)
         joined = [self._poses[name].transform(self._solid[name]) for name in self._frames.paths]
         self._ground = min((float(each[:, 2].min()) for each in joined if len(each)), default=0.0)
 
@@ -275,6 +287,7 @@ class VehicleScene:
             if kind != "box" and body.frames and not self.is_edited:
                 for node in drawn:
                     self._add_pick(node, lambda _: body.frames[0].full_name)
+            self._groups["shapes"] += drawn
             if drawn:
                 break
         places = np.array([frame.pose.xyz for frame in body]).reshape(-1, 3)
@@ -290,6 +303,7 @@ class VehicleScene:
             axes_length=0.05 * size,
             axes_radius=0.0015 * size,
         )
+        self._groups["axes"].append(axes)
         self._add_pick(axes, lambda event: body.frames[event.instance_index or 0].full_name)
         for number, frame in enumerate(body.frames):
             self._add_label(NameLabels.FRAMES, f"{root}/names/{number}", frame.full_name, body.name, frame.pose.xyz)
@@ -362,6 +376,15 @@ class VehicleScene:
         for each, is_visible in zip(self._labels, wanted.tolist(), strict=True):
             if each.handle.visible != is_visible:
                 each.handle.visible = is_visible
+
+    def hide(self, bodies: frozenset[str], kinds: frozenset[str]) -> None:
+        """Hide bodies by name and what is of one of `KINDS`, and show the others."""
+        self._hidden = (bodies, kinds)
+        for name, node in self._bodies.items():
+            node.visible = name not in bodies
+        for kind, nodes in self._groups.items():
+            for each in nodes:
+                each.visible = kind not in kinds
 
     def find_frame(self, camera: Any, x: float, y: float, distance: float) -> tuple[str, Pose] | None:
         """Return the frame at a place of a camera's picture, and its pose in the base frame; None where there is none.

@@ -113,6 +113,8 @@ class Viewer:
             play=lambda on: self._change_time(lambda panel: panel.play(on)),
             follow=lambda: self._change_time(lambda panel: panel.follow()),
             find_frame=self._find_frame,
+            hide=lambda bodies, kinds: self._actions.put(partial(self._scene.hide, bodies, kinds)),
+            pick=self._pick,
         )
         page.respond = self._dashboard.respond
 

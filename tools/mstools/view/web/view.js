@@ -133,6 +133,64 @@ frame.addEventListener("load", () => {
 });
 find("scene").addEventListener("pointerleave", () => { hovered = null; find("hover").hidden = true; });
 
+// --- the tree of bodies and frames
+
+let treeOf = null;
+
+async function showTree() {
+  if (find("tree").hidden || treeOf === state?.revision) return;
+  treeOf = state?.revision;
+  const tree = await fetchJson("/tree");
+  const makeCheck = (name, isShown) => {
+    const label = document.createElement("label");
+    const check = document.createElement("input");
+    check.type = "checkbox";
+    check.checked = isShown;
+    check.name = name;
+    check.addEventListener("change", hideUnchecked);
+    label.append(check, ` ${name}`);
+    return label;
+  };
+  const [legend] = find("tree").querySelectorAll("legend");
+  legend.parentElement.replaceChildren(legend, ...tree.kinds.map((each) => makeCheck(each.name, each.shown)));
+  find("tree").querySelector("ul").replaceChildren(...tree.bodies.map((body) => {
+    const item = document.createElement("li");
+    const frames = document.createElement("ul");
+    frames.append(...body.frames.map((name) => {
+      const line = document.createElement("li");
+      const button = document.createElement("button");
+      button.type = "button";
+      button.textContent = name.slice(body.name.length + 1);
+      button.title = `${name}: click for the query, with Shift as its frame of reference`;
+      button.dataset.frame = name;
+      button.addEventListener("click", (event) => fetchJson(`/pick?${new URLSearchParams({ frame: name, reference: +event.shiftKey })}`));
+      line.append(button);
+      return line;
+    }));
+    item.append(makeCheck(body.name, body.shown), frames);
+    return item;
+  }));
+  searchTree();
+}
+
+function hideUnchecked() {
+  const list = (where) => JSON.stringify([...find("tree").querySelectorAll(`${where} input:not(:checked)`)].map((each) => each.name));
+  fetchJson(`/hide?${new URLSearchParams({ bodies: list("ul"), kinds: list("fieldset") })}`);
+}
+
+function searchTree() {
+  const wanted = find("tree").querySelector("input[type=search]").value.toLowerCase();
+  for (const item of find("tree").querySelectorAll(":scope > ul > li")) {
+    const isOfBody = item.querySelector("label").textContent.toLowerCase().includes(wanted);
+    let count = 0;
+    for (const line of item.querySelectorAll("ul > li")) {
+      line.hidden = !isOfBody && !line.textContent.toLowerCase().includes(wanted);
+      count += !line.hidden;
+    }
+    item.hidden = !isOfBody && !count;
+  }
+}
+
 // --- panes
 
 const panes = recall("panes", { scene: true, map: false, plots: true });
@@ -140,14 +198,15 @@ const panes = recall("panes", { scene: true, map: false, plots: true });
 function showPanes() {
   const hasTime = state === null || state.has_time;
   if (!panes.scene && !panes.map && !panes.plots) panes.scene = true;
+  find("tree").hidden = !panes.tree;
   find("scene").hidden = !panes.scene;
   find("map").hidden = !panes.map || !hasTime;
   find("plots").hidden = !panes.plots || !hasTime;
-  document.querySelector("main").hidden = find("scene").hidden && find("map").hidden;
+  document.querySelector("main").hidden = find("tree").hidden && find("scene").hidden && find("map").hidden;
   find("plots").style.flexGrow = document.querySelector("main").hidden ? 1 : "";
   for (const button of document.querySelectorAll("[data-pane]")) {
-    button.setAttribute("aria-pressed", panes[button.dataset.pane]);
-    button.hidden = button.dataset.pane !== "scene" && !hasTime;
+    button.setAttribute("aria-pressed", panes[button.dataset.pane] ?? false);
+    button.hidden = ["map", "plots"].includes(button.dataset.pane) && !hasTime;
   }
   for (const chart of charts) Plotly.Plots.resize(chart);
 }
@@ -156,6 +215,7 @@ function togglePane(name) {
   panes[name] = !panes[name];
   remember("panes", panes);
   showPanes();
+  showTree();
   map.refresh();
   loadCharts();
 }
@@ -300,6 +360,7 @@ async function poll() {
     const text = JSON.stringify(state);
     showStrip();
     if (before?.has_time !== state.has_time) showPanes();
+    showTree();
     if (state.has_time) {
       showTimeBar();
       showChoice();
@@ -334,6 +395,7 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", (event) =>
 find("theme").addEventListener("click", () => setTheme(root.dataset.theme === "dark" ? "light" : "dark"));
 for (const button of document.querySelectorAll("[data-pane]"))
   button.addEventListener("click", () => togglePane(button.dataset.pane));
+find("tree").querySelector("input[type=search]").addEventListener("input", searchTree);
 find("play").addEventListener("click", () => fetchJson(`/play?on=${state?.is_playing ? 0 : 1}`).then(poll));
 find("live").addEventListener("click", () => fetchJson("/live").then(poll));
 find("whole").addEventListener("click", showAll);
@@ -341,7 +403,7 @@ find("slider").addEventListener("input", () => { isSliding = true; seek(find("sl
 find("slider").addEventListener("change", () => { isSliding = false; });
 document.addEventListener("keydown", (event) => {
   if (event.target.matches("input, select, textarea") || event.ctrlKey || event.metaKey || event.altKey) return;
-  const pane = { s: "scene", m: "map", p: "plots" }[event.key];
+  const pane = { t: "tree", s: "scene", m: "map", p: "plots" }[event.key];
   if (pane) togglePane(pane);
   else if (event.key === " " && state?.has_time) find("play").click();
   else if (event.key === "ArrowLeft" && state?.has_time) seek(state.at - (event.shiftKey ? 10 : 1));
