@@ -208,6 +208,8 @@ def read_tree(glb: bytes) -> dict[str, Any]:
     return dict(json.loads(glb[20 : 20 + int.from_bytes(glb[12:16], "little")]))
 
 
+# pycollada, which reads and writes DAE files, does that
+@pytest.mark.filterwarnings("ignore:Setting the shape on a NumPy array:DeprecationWarning")
 def test_given_colors_of_a_mesh_then_they_are_drawn_and_those_of_the_shape_replace_them(tmp_path: Path) -> None:
     (tmp_path / "two.mtl").write_text("newmtl red\nKd 0.5 0 0\nnewmtl green\nKd 0 1 0\n")
     faces = TETRAHEDRON.replace("f 1 3 2", "usemtl red\nf 1 3 2").replace("f 1 4 3", "usemtl green\nf 1 4 3")
