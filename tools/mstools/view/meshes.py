@@ -22,7 +22,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import trimesh
-from scipy.spatial import ConvexHull, QhullError
 from trimesh.exchange.gltf import export_glb
 
 from modelserver.transforms.so3 import Array
@@ -145,6 +144,9 @@ def _search_below(root: Path, name: str) -> tuple[Path, ...]:
 
 # --- reading
 
+OUTLINE_DIVISIONS: Final = 2
+"""Divisions of an icosahedron for the directions of an outline: 162, 16 degrees apart, with the axes among them."""
+
 
 @functools.lru_cache(maxsize=128)
 def _read_mesh(path: Path, mtime: int, color: Rgba | None) -> Mesh:
@@ -180,11 +182,24 @@ def _read_mesh(path: Path, mtime: int, color: Rgba | None) -> Mesh:
 
 
 def _find_outline(vertices: Array) -> Array:
-    """Return the corners of the convex hull; all vertices of what is flat, which has none."""
-    try:
-        return np.asarray(vertices[ConvexHull(vertices).vertices])
-    except QhullError:
-        return vertices
+    """Return the vertices that are outermost in one of many directions: corners of the convex hull."""
+    directions = trimesh.creation.icosphere(OUTLINE_DIVISIONS).vertices
+    return np.asarray(vertices[np.unique([int(np.argmax(vertices @ each)) for each in directions])])
+
+
+def _label_patches(pairs: npt.NDArray[np.int64], count: int) -> npt.NDArray[np.int64]:
+    """Return for each of `count` faces the least number of those that are joined to it by pairs (n, 2)."""
+    labels = np.arange(count)
+    while True:
+        first, second = labels[pairs[:, 0]], labels[pairs[:, 1]]
+        joined = labels.copy()
+        np.minimum.at(joined, first, second)
+        np.minimum.at(joined, second, first)
+        while not np.array_equal(joined, joined[joined]):
+            joined = joined[joined]
+        if np.array_equal(joined, labels):
+            return labels
+        labels = joined
 
 
 def _prepare(mesh: Any, is_linear: bool, with_colors: bool) -> trimesh.Trimesh:
@@ -193,8 +208,7 @@ def _prepare(mesh: Any, is_linear: bool, with_colors: bool) -> trimesh.Trimesh:
     if not (faces.min() >= 0 and faces.max() < len(vertices) and np.isfinite(vertices).all()):
         raise MeshError("has triangles with corners that it does not have")
     smooth = mesh.face_adjacency[mesh.face_adjacency_angles < CREASE]
-    label_components: Any = trimesh.graph.connected_component_labels
-    patches = label_components(smooth, node_count=len(faces))
+    patches = _label_patches(np.asarray(smooth), len(faces))
     corners = np.stack([np.repeat(patches, 3), faces.ravel()], axis=1)
     split, inverse = np.unique(corners, axis=0, return_inverse=True)
     chosen = split[:, 1]
@@ -204,7 +218,13 @@ def _prepare(mesh: Any, is_linear: bool, with_colors: bool) -> trimesh.Trimesh:
         uv = mesh.visual.uv
         visual = make_textured(None if uv is None else uv[chosen], mesh.visual.material)
     elif with_colors and mesh.visual.kind in ("vertex", "face"):
-        colors = mesh.visual.vertex_colors[chosen] / 255.0
+        if mesh.visual.kind == "face":
+            # the mean of the faces at a corner
+            sums = np.zeros((len(chosen), 4))
+            np.add.at(sums, inverse.ravel(), np.repeat(mesh.visual.face_colors, 3, axis=0) / 255.0)
+            colors = sums / np.bincount(inverse.ravel())[:, None]
+        else:
+            colors = mesh.visual.vertex_colors[chosen] / 255.0
         if not is_linear:
             colors[:, :3] = _linearize(colors[:, :3])
         visual = trimesh.visual.ColorVisuals(vertex_colors=np.round(255.0 * colors).astype(np.uint8))
