@@ -16,7 +16,7 @@ pytest.importorskip("viser", reason="the extra view is not installed: pip instal
 
 from modelserver.earth.geodesy import geodesy_of
 from mstools.commands.demo import find_vehicle_file
-from mstools.recordings.drive import Drive
+from mstools.recordings.drive import QUATERNION, Drive
 from mstools.view.page import open_page
 from mstools.view.signals import compute_headings, compute_speeds
 from mstools.view.sources import open_geometry, open_log
@@ -58,7 +58,7 @@ def test_given_a_time_of_a_log_then_the_strip_has_validity_motion_and_ages(shown
     table = drive.poses
     row = table.find(drive.begin + round(AT * 1e6))
     assert read_figure(page, "speed") == pytest.approx(compute_speeds(table.utimes, table.rows)[row], abs=0.02)
-    assert read_figure(page, "heading") == pytest.approx(compute_headings(table.rows)[row], abs=1.0)
+    assert read_figure(page, "heading") == pytest.approx(compute_headings(table.rows[:, QUATERNION])[row], abs=1.0)
     assert page.get_by_label("Age of each sensor").get_by_role("listitem").count() == 4
     page.evaluate("seek(1)")
     page.get_by_role("status").get_by_text("INVALID").wait_for()

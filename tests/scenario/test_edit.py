@@ -90,6 +90,14 @@ def edit(browser: Browser, path: Path, url: str, *more: str) -> Iterator[Page]:
         yield page
 
 
+def find_gizmo_box(page: Page) -> Locator:
+    """Return the checkbox of the gizmo, with its folder open."""
+    box = find_fields(page, "Gizmo")
+    if not box.is_visible():
+        page.get_by_text("Gizmo", exact=True).first.click()
+    return box
+
+
 def take_picture(page: Page) -> np.ndarray:
     """Return the picture of a page once it does not change any more."""
     before = np.zeros((1, 1, 3), int)
@@ -295,9 +303,7 @@ def test_given_a_gizmo_then_a_drag_moves_the_frame_and_undo_brings_it_back(edite
 
 def test_given_other_items_and_kinds_in_turn_then_the_gizmo_is_where_the_item_is(edited_page: EditedPage) -> None:
     _, page, _ = edited_page
-    box = find_fields(page, "Gizmo")
-    if not box.is_visible():
-        page.get_by_text("Gizmo", exact=True).first.click()
+    box = find_gizmo_box(page)
     box.set_checked(True)
     choose(page, "Kind", "constraint")
     # its first item, and then another one of the same body
@@ -314,9 +320,7 @@ def test_given_other_items_and_kinds_in_turn_then_the_gizmo_is_where_the_item_is
 
 def test_given_a_selected_item_then_it_is_outlined_without_the_gizmo_too(edited_page: EditedPage) -> None:
     _, page, _ = edited_page
-    box = find_fields(page, "Gizmo")
-    if not box.is_visible():
-        page.get_by_text("Gizmo", exact=True).first.click()
+    box = find_gizmo_box(page)
     box.set_checked(False)
     counts = []
     for kind, name in (("body", "Raptor"), ("frame", "FLEA:Lens"), ("constraint", MOUNT)):

@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("plotly", reason="the extra view is not installed: pip install -e '.[view]'")
 
 from modelserver.messages import Invalid
-from mstools.recordings.drive import Drive
+from mstools.recordings.drive import QUATERNION, Drive
 from mstools.report.charts import COLUMNS
 from mstools.view.signals import CHARTS, Span, compute_headings, compute_speeds, make_panels, make_strip
 
@@ -47,7 +47,7 @@ def test_given_a_circle_then_speed_and_heading_are_those_of_the_drive() -> None:
     drive = make_drive(10.0)
     utimes, rows = drive.poses.utimes, drive.poses.rows
     assert compute_speeds(utimes, rows)[10:-10] == pytest.approx(np.full(len(rows) - 20, SPEED), rel=1e-3)
-    headings = compute_headings(rows)
+    headings = compute_headings(rows[:, QUATERNION])
     assert headings[0] == pytest.approx(90.0)
     assert headings[30] == pytest.approx(90.0 - math.degrees(SPEED / RADIUS), abs=1e-6)
 

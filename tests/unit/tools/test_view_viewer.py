@@ -10,13 +10,11 @@ import pytest
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install -e '.[view]'")
 
-from modelserver.client.mirror import LocalPlatform
-from modelserver.client.mirror_state import MirrorState
 from modelserver.messages import VALID, ChannelHealth, Health
 from mstools.commands.demo import find_vehicle_file
 from mstools.recordings.drive import Drive
 from mstools.view.page import Page, open_page
-from mstools.view.sources import Source, open_geometry
+from mstools.view.sources import NoGeometry, Source, open_geometry
 from mstools.view.viewer import Viewer, _format_sensors
 
 URDF = """<robot name="r">
@@ -31,18 +29,9 @@ def page() -> Iterator[Page]:
     opened.close()
 
 
-class NoPlatform(LocalPlatform):
-    """A client that never received anything."""
-
-    where = "here"
-
-    def read_state(self) -> tuple[MirrorState, int]:
-        return MirrorState(), 0
-
-
 def make_live() -> Source:
     """Return a source of a service that never publishes."""
-    return Source("live", Drive(), NoPlatform(), is_live=True)
+    return Source("live", Drive(), NoGeometry("here"), is_live=True)
 
 
 def test_given_an_error_of_an_action_then_the_viewer_goes_on(page: Page, capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from modelserver.errors import ModelServerError
+from modelserver.files import FileKind, detect_file_kind
 from modelserver.server.journal.writer import list_segments
 from mstools.archive.storage import open_filesystem, unify_errors
 from mstools.recordings.bag_log import BAG_BEGINNINGS, BAG_SUFFIXES, BEGINNING
 
-LCM_MAGIC: Final = b"\xed\xa1\xda\x01"
 SUFFIXES: Final = (".lcm", *BAG_SUFFIXES)
 """Names of recordings: one of these is a log also if its beginning is damaged."""
 
@@ -81,7 +81,11 @@ def _is_one(folder: Path) -> bool:
 
 def _begins_as_recording(path: Path) -> bool:
     with path.open("rb") as file:
-        return file.read(BEGINNING).startswith((LCM_MAGIC, *BAG_BEGINNINGS))
+        return _is_beginning(file.read(BEGINNING))
+
+
+def _is_beginning(data: bytes) -> bool:
+    return data.startswith(BAG_BEGINNINGS) or detect_file_kind(data) is FileKind.LOG
 
 
 def _expand_url(given: str) -> Iterator[str]:
@@ -102,9 +106,7 @@ def _expand_url(given: str) -> Iterator[str]:
 
 def _begins_as_recording_at(fs: Any, path: str, size: int) -> bool:
     # storage refuses a range of an empty file; the order of the arguments differs between file systems
-    return size >= BEGINNING and bool(
-        fs.cat_file(path, start=0, end=BEGINNING).startswith((LCM_MAGIC, *BAG_BEGINNINGS))
-    )
+    return size >= BEGINNING and _is_beginning(fs.cat_file(path, start=0, end=BEGINNING))
 
 
 @contextmanager

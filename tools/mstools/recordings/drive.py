@@ -195,8 +195,9 @@ class ChannelCount:
             self._first = self._since = now
         self.count += 1
         self.last = now
-        if stamp:
-            self._latency = max((now - stamp) * 1e-6, self._latency if math.isfinite(self._latency) else -math.inf)
+        # also in place of nan
+        if stamp and not (latency := (now - stamp) * 1e-6) <= self._latency:
+            self._latency = latency
         if now - self._since >= 1_000_000:
             self.rate = (self.count - self._counted) / ((now - self._since) * 1e-6)
             self.course.append(now, self.rate, self._latency)

@@ -321,9 +321,9 @@ def decimate(points: Array, columns: Array) -> Array:
     return points[chosen]
 
 
-def encode_figure(figure: dict[str, Any]) -> str:
-    """Return a figure as JSON."""
-    return json.dumps(figure, allow_nan=False, separators=(",", ":"))
+def encode_json(value: object) -> str:
+    """Return a figure, or what else a page reads, as JSON. Raises ValueError for numbers that JSON does not have."""
+    return json.dumps(value, allow_nan=False, separators=(",", ":"))
 
 
 def _render_chart(label: str, figure: dict[str, Any], is_over_time: bool = False) -> str:
@@ -332,7 +332,7 @@ def _render_chart(label: str, figure: dict[str, Any], is_over_time: bool = False
     height = f"height:{figure['layout']['height']}px"
     attributes = f'class="chart" role="img" aria-label="{html.escape(label)}"{time} style="{height}"'
     # within HTML nothing may look like the end of the script
-    inside = encode_figure(figure).replace("<", "\\u003c")
+    inside = encode_json(figure).replace("<", "\\u003c")
     return f'<div {attributes}><script type="application/json">{inside}</script></div>'
 
 

@@ -3,10 +3,10 @@
     /               the page, in which /scene is the 3D scene (viser's)
     /state          the strip: validity, speed, heading, uncertainty, ages, time
     /charts         the charts of a span of time; /strip the validity over it
-    /map            what a view of the map shows; /tile an image below it
+    /map            what a view of the map shows
     /hover          the frame below the pointer in the scene
     /tree           bodies with their frames, and what is hidden; /hide, /pick change that and the query
-    /seek, /play, /pause, /live   change the time that is shown
+    /seek, /play, /live   change the time that is shown
     /assets/NAME    scripts and styles
 
 Answers are computed in threads of the server, under the source's lock where they read the drive. A change of time is
@@ -30,9 +30,9 @@ import numpy as np
 from modelserver.messages import Health
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
-from mstools.recordings.drive import Drive, Picture
-from mstools.report.charts import encode_figure, read_plotly
-from mstools.view.map import View, describe_map, fit_view
+from mstools.recordings.drive import QUATERNION, Drive, Picture
+from mstools.report.charts import encode_json, read_plotly
+from mstools.view.map import MAX_METERS_PER_PIXEL, View, describe_map, fit_view
 from mstools.view.page import Reply
 from mstools.view.scene import KINDS
 from mstools.view.signals import (
@@ -107,9 +107,9 @@ class Dashboard:
         if path.startswith("/assets/"):
             return _read_asset(path.removeprefix("/assets/"))
         answer = self._answers.get(path)
-        return None if answer is None else Reply(answer(self, query))
+        return None if answer is None else Reply(encode_json(answer(self, query)).encode())
 
-    def _describe_state(self, query: Mapping[str, str]) -> bytes:
+    def _describe_state(self, query: Mapping[str, str]) -> dict[str, Any]:
         source, shown = self._source, self.shown
         now = time.time_ns() // 1000 if source.is_live else 0
         with source.lock:
@@ -142,18 +142,18 @@ class Dashboard:
             }
             for each in sensors
         ]
-        return _encode(state)
+        return state
 
-    def _make_charts(self, query: Mapping[str, str]) -> bytes:
+    def _make_charts(self, query: Mapping[str, str]) -> dict[str, Any]:
         names = [each for each in query.get("names", "").split(",") if each]
         with self._source.lock:
             drive = self._source.drive
-            return encode_figure(make_panels(drive, self._read_span(drive, query), names)).encode()
+            return make_panels(drive, self._read_span(drive, query), names)
 
-    def _make_strip(self, query: Mapping[str, str]) -> bytes:
+    def _make_strip(self, query: Mapping[str, str]) -> dict[str, Any]:
         with self._source.lock:
             drive = self._source.drive
-            return encode_figure(make_strip(drive, self._read_span(drive, query))).encode()
+            return make_strip(drive, self._read_span(drive, query))
 
     def _read_span(self, drive: Drive, query: Mapping[str, str]) -> Span:
         begin, end = (_read_number(query, name, 0.0, 1e9) for name in ("from", "to"))
@@ -161,71 +161,70 @@ class Dashboard:
             raise ValueError("the span is empty")
         return Span(drive.begin + round(begin * 1e6), drive.begin + round(end * 1e6), drive.begin)
 
-    def _describe_map(self, query: Mapping[str, str]) -> bytes:
+    def _describe_map(self, query: Mapping[str, str]) -> dict[str, Any]:
         shown = self.shown
         width, height = (round(_read_number(query, name, 1.0, MAX_PIXELS)) for name in ("width", "height"))
         with self._source.lock:
             drive = self._source.drive
             picture = drive.get_picture(shown.utime)
-            view = fit_view(drive, width, height)
             if "scale" in query:
-                scale = _read_number(query, "scale", 1e-4, 2e3)
+                scale = _read_number(query, "scale", 1e-4, MAX_METERS_PER_PIXEL)
                 east, north = (_read_number(query, name, -1e7, 1e7) for name in ("east", "north"))
                 view = View(east, north, scale, width, height)
+            else:
+                view = fit_view(drive, width, height)
             if query.get("follow") and picture.pose is not None:
                 east, north, _ = picture.pose.xyz
                 view = replace(view, east=east, north=north)
-            return _encode(describe_map(drive, picture, shown.trail_s, view, shown.places))
+            return describe_map(drive, picture, shown.trail_s, view, shown.places)
 
-    def _change_time(self, query: Mapping[str, str]) -> bytes:
+    def _change_time(self, query: Mapping[str, str]) -> dict[str, Any]:
         self._seek(_read_number(query, "at", 0.0, 1e9))
-        return b"{}"
+        return {}
 
-    def _change_play(self, query: Mapping[str, str]) -> bytes:
+    def _change_play(self, query: Mapping[str, str]) -> dict[str, Any]:
         self._play(query.get("on") == "1")
-        return b"{}"
+        return {}
 
-    def _change_live(self, query: Mapping[str, str]) -> bytes:
+    def _change_live(self, query: Mapping[str, str]) -> dict[str, Any]:
         self._follow()
-        return b"{}"
+        return {}
 
-    def _describe_frame(self, query: Mapping[str, str]) -> bytes:
+    def _describe_frame(self, query: Mapping[str, str]) -> dict[str, Any]:
         x, y = (_read_number(query, name, 0.0, 1.0) for name in ("x", "y"))
         found = self._find_frame(query.get("browser", ""), x, y)
         if found is None:
-            return _encode({"name": ""})
+            return {"name": ""}
         name, pose = found
         xyz, rpy = ([value + 0.0 for value in each] for each in (pose.xyz, map(math.degrees, pose.rpy)))
         place = ", ".join(f"{value:.3f}" for value in xyz)
         angles = ", ".join(f"{value:.1f}" for value in rpy)
-        return _encode({"name": name, "pose": f"{place} m; {angles} deg"})
+        return {"name": name, "pose": f"{place} m; {angles} deg"}
 
-    def _describe_tree(self, query: Mapping[str, str]) -> bytes:
+    def _describe_tree(self, query: Mapping[str, str]) -> dict[str, Any]:
         with self._source.lock:
             model, _ = self._source.drive.get_geometry(self.shown.utime)
         bodies, kinds = self._hidden
         listed = [] if model is None else model.bodies
-        return _encode(
-            {
-                "bodies": [
-                    {"name": body.name, "shown": body.name not in bodies, "frames": [each.full_name for each in body]}
-                    for body in listed
-                ],
-                "kinds": [{"name": kind, "shown": kind not in kinds} for kind in KINDS],
-            }
-        )
+        return {
+            "bodies": [
+                {"name": body.name, "shown": body.name not in bodies, "frames": [each.full_name for each in body]}
+                for body in listed
+            ],
+            "kinds": [{"name": kind, "shown": kind not in kinds} for kind in KINDS],
+        }
 
-    def _change_hidden(self, query: Mapping[str, str]) -> bytes:
+    def _change_hidden(self, query: Mapping[str, str]) -> dict[str, Any]:
         bodies, kinds = (_read_names(query, name) for name in ("bodies", "kinds"))
         self._hidden = (bodies, kinds)
         self._hide(bodies, kinds)
-        return b"{}"
+        return {}
 
-    def _change_query(self, query: Mapping[str, str]) -> bytes:
+    def _change_query(self, query: Mapping[str, str]) -> dict[str, Any]:
         self._pick(query.get("frame", ""), query.get("reference") == "1")
-        return b"{}"
+        return {}
 
-    _answers: Final[Mapping[str, Callable[[Dashboard, Mapping[str, str]], bytes]]] = {
+    _answers: Final[Mapping[str, Callable[[Dashboard, Mapping[str, str]], dict[str, Any]]]] = {
         "/state": _describe_state,
         "/charts": _make_charts,
         "/strip": _make_strip,
@@ -265,15 +264,11 @@ def _describe_pose(drive: Drive, picture: Picture) -> dict[str, Any]:
         return found
     values = {
         "speed": float(compute_speeds(utimes, rows)[here]),
-        "heading": float(compute_headings(rows[here : here + 1])[0]),
+        "heading": float(compute_headings(rows[here : here + 1, QUATERNION])[0]),
         "sigma": float(compute_sigmas(rows[here : here + 1])[0]),
         "level": level,
     }
     return found | {name: value if math.isfinite(value) else None for name, value in values.items()}
-
-
-def _encode(value: object) -> bytes:
-    return json.dumps(value, allow_nan=False, separators=(",", ":")).encode()
 
 
 def _read_number(query: Mapping[str, str], name: str, low: float, high: float) -> float:

@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from modelserver.earth import Origin
 from modelserver.earth.geodesy import GeodesyError, geodesy_of
-from modelserver.messages import Invalid
 from modelserver.transforms.so3 import Array, Vector3
 from mstools.recordings.drive import FIX_COLOR, FIX_POSITION, INVALID, MAX_STAMP, Drive, FixColor, Picture
 from mstools.view.signals import compute_headings
@@ -82,21 +81,13 @@ def describe_map(
         level = picture.horizontal_protection_level
         found["vehicle"] = {
             "at": _round(picture.pose.xyz[:2]),
-            "heading": round(float(compute_headings(_as_row(picture))[0]), 2),
+            "heading": round(float(compute_headings(np.array([picture.pose.wxyz]))[0]), 2),
             "valid": not picture.invalid,
-            "reason": Invalid(picture.invalid).explain() if picture.invalid else "",
             "level": round(level, 3) if math.isfinite(level) else None,
         }
     if drive.origin is not None:
         found["origin"] = describe_origin(drive.origin, view)
     return found
-
-
-def _as_row(picture: Picture) -> Array:
-    assert picture.pose is not None
-    row = np.zeros((1, 7))
-    row[0, 3:] = picture.pose.wxyz
-    return row
 
 
 def _round(values: tuple[float, ...]) -> list[float]:

@@ -136,9 +136,9 @@ def compute_speeds(utimes: npt.NDArray[np.int64], rows: Array) -> Array:
     return np.where(is_one, steps / np.where(seconds > 0.0, seconds, 1.0), math.nan)
 
 
-def compute_headings(rows: Array) -> Array:
-    """Return the headings of poses, degrees clockwise from grid north, 0 to 360."""
-    w, x, y, z = rows[:, QUATERNION].T
+def compute_headings(quaternions: Array) -> Array:
+    """Return the headings of rotations (n, 4), scalar first: degrees clockwise from grid north, 0 to 360."""
+    w, x, y, z = quaternions.T
     yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     found: Array = np.mod(90.0 - np.degrees(yaw), 360.0)
     return found
@@ -187,7 +187,7 @@ def _make_speed(drive: Drive, span: Span) -> Panel:
 
 def _make_heading(drive: Drive, span: Span) -> Panel:
     seconds, _, rows, cut = _select_poses(drive, span)
-    headings = compute_headings(rows)
+    headings = compute_headings(rows[:, QUATERNION])
     cut = cut | np.append(False, np.abs(np.diff(headings)) > 180.0)[: len(cut)]
     x, y = _interrupt(seconds, headings, at=cut)
     return Panel("Heading (from grid north)", _make_axis("deg", [y], 5.0), [Series("", x, y)])

@@ -5,12 +5,11 @@ const FIX_COLORS = ["--used", "--rejected", "--monitored", "--undecided"];
 // below this an ellipse is inside its dot, pixels
 const LEAST_ELLIPSE = 3;
 
-function createMap(section, fetchJson, onView) {
+function createMap(section, fetchJson) {
   const canvas = section.querySelector("canvas");
   const readout = section.querySelector(".readout");
   const bar = section.querySelector(".scale");
   const pen = canvas.getContext("2d");
-  const images = new Map();
   // the view: null before the first answer
   let view = null;
   // whether it fits the track, until a person moves it
@@ -69,10 +68,6 @@ function createMap(section, fetchJson, onView) {
     pen.setTransform(density, 0, 0, density, 0, 0);
     pen.clearRect(0, 0, width, height);
     pen.font = "11px system-ui, sans-serif";
-    for (const tile of data.tiles ?? []) paintTile(tile, density);
-    pen.setTransform(density, 0, 0, density, 0, 0);
-    paintGrid(data.grids?.geodetic ?? [], readTone("--line"), [2, 4], true);
-    paintGrid(data.grids?.utm ?? [], readTone("--line"), [], false);
     paintFixes();
     pen.lineWidth = 2;
     for (const line of data.trail) {
@@ -84,39 +79,6 @@ function createMap(section, fetchJson, onView) {
     if (data.vehicle) paintVehicle(data.vehicle);
     paintScale();
     describe();
-  }
-
-  function paintTile(tile, density) {
-    let image = images.get(tile.key);
-    if (!image) {
-      image = new Image();
-      image.onload = paint;
-      image.src = `/tile?key=${encodeURIComponent(tile.key)}`;
-      images.set(tile.key, image);
-    }
-    if (!image.complete || !image.naturalWidth) return;
-    const [nw, ne, sw] = tile.corners.map(toPixels);
-    const { naturalWidth: w, naturalHeight: h } = image;
-    pen.setTransform(
-      (density * (ne[0] - nw[0])) / w, (density * (ne[1] - nw[1])) / w,
-      (density * (sw[0] - nw[0])) / h, (density * (sw[1] - nw[1])) / h,
-      density * nw[0], density * nw[1],
-    );
-    pen.drawImage(image, 0, 0);
-  }
-
-  function paintGrid(lines, color, dash, isAtEnd) {
-    const [width, height] = getSize();
-    pen.strokeStyle = color;
-    pen.setLineDash(dash);
-    pen.lineWidth = 1;
-    for (const line of lines) { trace(line.points); pen.stroke(); }
-    pen.setLineDash([]);
-    pen.fillStyle = readTone("--soft");
-    for (const line of lines) {
-      const [x, y] = toPixels(line.points[isAtEnd ? line.points.length - 1 : 0]);
-      pen.fillText(line.label, Math.min(Math.max(x + 3, 3), width - 90), Math.min(Math.max(y - 3, 46), height - 26));
-    }
   }
 
   function paintFixes() {
