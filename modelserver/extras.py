@@ -22,6 +22,7 @@ EXTRAS: Final = {
     "bags": ("rosbags", "mcap"),
     "dynamics": ("pinocchio",),
     "foxglove": ("foxglove",),
+    "map": ("rasterio",),
     "report": ("plotly",),
     "view": ("viser",),
 }

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser, ConsoleMessage, Locator, Page
     from viser import ViserServer
 
+    from mstools.view.background import Background
     from mstools.view.editor import Editing
     from mstools.view.sources import Source
 
@@ -100,26 +101,36 @@ def open_link(
 
 @contextmanager
 def show(
-    browser: Browser, source: Source, editing: Editing | None = None, sharpness: float = 0.5, path: str = "scene"
+    browser: Browser,
+    source: Source,
+    editing: Editing | None = None,
+    sharpness: float = 0.5,
+    path: str = "scene",
+    background: Background | None = None,
 ) -> Iterator[Page]:
     """Show a source of the viewer in a browser, with the viewer in a thread; `sharpness` as in `open_link`.
 
     `path`: `scene` shows the scene with its tabs alone, an empty one the whole page.
     """
-    with serve(browser, source, editing, sharpness, path) as (page, _):
+    with serve(browser, source, editing, sharpness, path, background) as (page, _):
         yield page
 
 
 @contextmanager
 def serve(
-    browser: Browser, source: Source, editing: Editing | None = None, sharpness: float = 0.5, path: str = "scene"
+    browser: Browser,
+    source: Source,
+    editing: Editing | None = None,
+    sharpness: float = 0.5,
+    path: str = "scene",
+    background: Background | None = None,
 ) -> Iterator[tuple[Page, ViserServer]]:
     """Show a source as `show` does; yield the page and its server."""
     from mstools.view.page import open_page
     from mstools.view.viewer import Viewer
 
     served = open_page(port=0)
-    viewer = Viewer(served, source, editing)
+    viewer = Viewer(served, source, editing, background)
     stop = threading.Event()
     thread = threading.Thread(target=viewer.run, args=(stop.is_set,))
     thread.start()

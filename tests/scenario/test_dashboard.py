@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 from support_browser import needs_browser, open_link, serve, show
 from support_view import record_drive
@@ -90,6 +91,45 @@ def test_given_the_map_when_the_vehicle_is_pointed_at_then_its_coordinates_are_r
     latitude, longitude = numbers[2:4]
     assert math.dist(geodesy_of(drive.origin).utm_from_geodetic(latitude, longitude, 0.0)[:2], numbers[:2]) < 0.1
     page.get_by_role("button", name="Map").click()
+
+
+def test_given_a_picture_of_the_ground_then_the_map_has_it_below_the_track_and_a_grid_where_asked_for(
+    browser: Browser, drive_log: Path, tmp_path: Path
+) -> None:
+    rasterio = pytest.importorskip("rasterio", reason="the extra map is not installed: pip install -e '.[map]'")
+    from mstools.view.background import open_background
+
+    source = open_log(drive_log)
+    origin = source.drive.origin
+    assert origin is not None
+    # green west of 10 m east of the origin, blue east of it
+    pixels = np.zeros((3, 200, 200), dtype=np.uint8)
+    pixels[1, :, :110] = pixels[2, :, 110:] = 200
+    place = rasterio.Affine(1.0, 0.0, origin.easting - 100.0, 0.0, -1.0, origin.northing + 100.0)
+    size = {"width": 200, "height": 200, "count": 3, "dtype": "uint8"}
+    with rasterio.open(tmp_path / "site.tif", "w", **size, crs=f"EPSG:{32600 + origin.zone}", transform=place) as file:
+        file.write(pixels)
+        file.update_tags(TIFFTAG_COPYRIGHT="Survey")
+    with show(browser, source, path="", background=open_background(tmp_path / "site.tif")) as page:
+        page.get_by_role("button", name="Map").click()
+        page.wait_for_function("document.querySelector('#map canvas').dataset.ground")
+        assert page.locator("#map .attribution").inner_text() == "Survey"
+
+        def find_color(east: float, north: float) -> list[int]:
+            x, y = page.evaluate(f"map.toPixels([{east}, {north}])")
+            read = f"document.querySelector('#map canvas').getContext('2d').getImageData({x}, {y}, 1, 1).data"
+            return list(page.evaluate(f"[...{read}]"))
+
+        page.evaluate("map.show([10, -60, 0.1])")
+        page.wait_for_function("document.querySelector('#map canvas').dataset.ground.startsWith('10,-60,0.1')")
+        assert find_color(9.0, -60.0) == pytest.approx([0, 200, 0, 255], abs=2)
+        assert find_color(11.0, -60.0) == pytest.approx([0, 0, 200, 255], abs=2)
+        for count, name in enumerate(("Grid", "Grid: UTM")):
+            page.get_by_role("button", name=name, exact=True).click()
+            page.wait_for_function("document.querySelector('#map canvas').dataset.grid > 4")
+            assert page.get_by_role("button", name=("Grid: UTM", "Grid: degrees")[count]).is_visible()
+        page.get_by_role("button", name="Ground").click()
+        assert find_color(9.0, -60.3)[3] == 0
 
 
 def test_given_the_plots_then_they_have_the_drive_and_a_click_shows_that_time(shown: tuple[Page, Drive]) -> None:

@@ -147,3 +147,13 @@ def test_given_a_log_of_fixes_alone_then_its_charts_and_map_are_there(tmp_path: 
     assert len(page.get("/map", width="800", height="400")["fixes"]) > 30
     rates = page.get("/charts", **{"from": "0", "to": "9", "names": "rates"})["data"]
     assert [each["name"] for each in rates] == ["GPS"]
+
+
+def test_given_no_picture_of_the_ground_then_none_is_sent_and_a_grid_only_when_asked_for(page: Page) -> None:
+    view = {"east": "0", "north": "0", "scale": "1", "width": "800", "height": "600"}
+    assert page.dashboard.respond("/background", view) is None
+    found = page.get("/map", **view)
+    assert (found["attribution"], found["grid"]) == (None, [])
+    assert len(page.get("/map", **view, grid="utm")["grid"]) > 5
+    with pytest.raises(ValueError, match="scale must be"):
+        page.get("/map", **{**view, "scale": "inf"}, grid="geodetic")

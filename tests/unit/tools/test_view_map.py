@@ -14,7 +14,7 @@ from modelserver.earth.geodesy import geodesy_of, origin_at
 from modelserver.messages import VALID, FixType, GpsSample, Invalid, SensorHeader
 from modelserver.wire.codec import encode
 from mstools.recordings.drive import Drive, FixColor
-from mstools.view.map import View, describe_map, describe_origin, fit_view
+from mstools.view.map import MIN_GRID_PX, View, describe_map, describe_origin, fit_view, make_grid
 
 START = 1_750_000_000_000_000
 ORIGIN = origin_at(50.27, -111.18, 700.0)
@@ -120,3 +120,42 @@ def test_given_fixes_alone_then_they_are_placed_around_the_first_and_the_drive_h
     assert drive.end - drive.begin == 1_900_000
     places, _ = drive.get_fixes(drive.end)
     assert places[-1][:2] - places[0][:2] == pytest.approx((57.0, 0.0), abs=0.01)
+
+
+@pytest.mark.parametrize("scale", [0.01, 0.3, 7.0, 150.0])
+def test_given_a_grid_of_utm_then_its_lines_are_at_round_coordinates_not_too_near(scale: float) -> None:
+    view = View(1234.5, -678.9, scale, 800, 600)
+    lines = make_grid(ORIGIN, view, "utm")
+    for letter, axis, first in (("E", 0, ORIGIN.easting), ("N", 1, ORIGIN.northing)):
+        found = [line for line in lines if line["label"].endswith(letter)]
+        places = [line["points"][0][axis] + first for line in found]
+        assert [float(line["label"][:-1]) for line in found] == pytest.approx(places, abs=0.002)
+        steps = np.diff(places) / scale
+        assert np.all((steps > 0.99 * MIN_GRID_PX) & (steps < 2.6 * MIN_GRID_PX))
+        assert len(found) >= 3
+
+
+@pytest.mark.parametrize("scale", [0.01, 0.3, 7.0, 150.0])
+def test_given_a_grid_of_degrees_then_each_point_of_a_line_has_the_coordinate_of_its_label(scale: float) -> None:
+    lines = make_grid(ORIGIN, View(1234.5, -678.9, scale, 800, 600), "geodetic")
+    geodesy = geodesy_of(ORIGIN)
+    for line in lines:
+        text, side = line["label"].split("\u00b0 ")
+        value = float(text) * (-1.0 if side in "SW" else 1.0)
+        for east, north in line["points"]:
+            place = geodesy.geodetic_from_utm(ORIGIN.easting + east, ORIGIN.northing + north, 0.0)
+            # rounded to a millimeter
+            assert place[1 if line["is_upright"] else 0] == pytest.approx(value, abs=2e-8)
+    assert sum(line["is_upright"] for line in lines) >= 3
+    assert sum(not line["is_upright"] for line in lines) >= 3
+
+
+def test_given_a_view_beyond_the_zone_then_there_is_no_grid_of_degrees() -> None:
+    assert make_grid(ORIGIN, View(0.0, 0.0, 2000.0, 8000, 8000), "geodetic") == []
+
+
+def test_given_a_view_across_180_degrees_then_its_meridians_have_both_sides() -> None:
+    lines = make_grid(origin_at(-17.0, 179.99, 0.0), View(0.0, 0.0, 10.0, 800, 600), "geodetic")
+    sides = {line["label"][-1] for line in lines if line["is_upright"]}
+    assert sides == {"E", "W"}
+    assert sum(line["is_upright"] for line in lines) < 10

@@ -28,6 +28,7 @@ from mstools.terminal.options import (
 from mstools.terminal.output import catch_signals, check_writable, escape, require_extra
 
 if TYPE_CHECKING:
+    from mstools.view.background import Background
     from mstools.view.editor import Editing
     from mstools.view.sources import Source
 
@@ -51,6 +52,10 @@ def command(
         option(
             "--package-path FOLDER", "Find meshes here too, package://NAME in the folder NAME. Repeatable.", exists=True
         ),
+    ] = None,
+    ground: Annotated[
+        Path | None,
+        option("--map FILE", "Picture of the ground below the map: GeoTIFF, MBTiles, or a folder of tiles."),
     ] = None,
     bind: Annotated[
         str, option("--bind ADDRESS", "Serve the page at this address. Beyond loopback its link has a token.")
@@ -81,19 +86,22 @@ def command(
       modelserver view config/raptor/geometry.yaml
       modelserver view config/raptor/vehicle.yaml --edit --key reload.key
       modelserver view drive.lcm
-      modelserver view drive.bag -c vehicle.yaml
+      modelserver view drive.bag -c vehicle.yaml --map site.mbtiles
       modelserver view --live
     """
     if live == (file is not None):
         raise typer.BadParameter("give a file or --live", param_hint="FILE")
     if config is not None and (live or edit or model is not None):
         raise typer.BadParameter("goes with a log: it runs the localization on it", param_hint="--config")
+    if ground is not None and edit:
+        raise typer.BadParameter("goes with a log or --live, which have a map", param_hint="--map")
     if edit and live:
         raise typer.BadParameter("goes with a geometry or vehicle file: that of the service", param_hint="--edit")
     check_installed()
     from mstools.view.page import ViewError, open_page
     from mstools.view.viewer import Viewer
 
+    background = open_map(ground)
     editing = open_editing(file, settings, url, prefix, key or "") if edit and file is not None else None
     with ExitStack() as stack:
         shown = file
@@ -104,6 +112,8 @@ def command(
             shown = stack.enter_context(open_localized(stack.enter_context(open_lcm_log(file)), config))
         source = open_source(shown, model, settings, url, prefix, timeout, editing, package_path or ())
         stack.callback(source.close)
+        if ground is not None and not source.has_time:
+            raise typer.BadParameter("goes with a log or --live, which have a map", param_hint="--map")
         try:
             page = open_page(bind, DEFAULT_PORT if port is None else port, with_token=edit)
         except ViewError:
@@ -111,7 +121,7 @@ def command(
                 raise
             page = open_page(bind, 0, with_token=edit)
         stack.callback(page.close)
-        viewer = Viewer(page, source, editing)
+        viewer = Viewer(page, source, editing, background)
         typer.echo(escape(f"{source.title}: {page.link} (Ctrl-C ends it)"))
         sys.stdout.flush()
         if editing is not None and editing.session.file.is_new:
@@ -134,6 +144,16 @@ def has_screen() -> bool:
 
 def check_installed() -> None:
     require_extra("view", "the viewer needs viser")
+
+
+def open_map(path: Path | None) -> Background | None:
+    """Open a picture of the ground. Raises MapError."""
+    if path is None:
+        return None
+    require_extra("map", "pictures of the ground need rasterio")
+    from mstools.view.background import open_background
+
+    return open_background(path)
 
 
 def open_editing(file: Path, settings: list[str] | None, url: str, prefix: str, key: str | Path) -> Editing:

@@ -3,7 +3,7 @@
     /               the page, in which /scene is the 3D scene (viser's)
     /state          the strip: validity, speed, heading, uncertainty, ages, time
     /charts         the charts of a span of time; /strip the validity over it
-    /map            what a view of the map shows
+    /map            what a view of the map shows; /background the picture of the ground below it
     /hover          the frame below the pointer in the scene
     /tree           bodies with their frames, and what is hidden; /hide, /pick change that and the query
     /seek, /play, /live   change the time that is shown
@@ -23,7 +23,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
 from mstools.recordings.drive import QUATERNION, Drive, Picture
 from mstools.report.charts import encode_json, read_plotly
-from mstools.view.map import MAX_METERS_PER_PIXEL, View, describe_map, fit_view
+from mstools.view.map import MAX_METERS_PER_PIXEL, View, describe_map, fit_view, make_grid
 from mstools.view.page import Reply
 from mstools.view.scene import KINDS
 from mstools.view.signals import (
@@ -45,6 +45,9 @@ from mstools.view.signals import (
     make_strip,
 )
 from mstools.view.sources import Source
+
+if TYPE_CHECKING:
+    from mstools.view.background import Background
 
 ASSETS: Final = {
     "view.css": ("mstools.view.web", "text/css; charset=utf-8"),
@@ -81,6 +84,7 @@ class Dashboard:
     follow : called to show the newest picture
     hide : called with the names of bodies and the kinds of things that are not to be drawn
     pick : called with a frame for the query, and whether it is its frame of reference
+    background : the picture of the ground below the map
     find_frame : returns the frame below the pointer of a browser and its pose in the base frame; None without one
     """
 
@@ -93,10 +97,11 @@ class Dashboard:
         find_frame: Callable[[str, float, float], tuple[str, Pose] | None],
         hide: Callable[[frozenset[str], frozenset[str]], None],
         pick: Callable[[str, bool], None],
+        background: Background | None = None,
     ):
         self._source = source
         self._seek, self._play, self._follow, self._find_frame = seek, play, follow, find_frame
-        self._hide, self._pick = hide, pick
+        self._hide, self._pick, self._background = hide, pick, background
         self._hidden: tuple[frozenset[str], frozenset[str]] = (frozenset(), frozenset())
         self.shown = Shown()
 
@@ -106,6 +111,8 @@ class Dashboard:
             return Reply((files("mstools.view.web") / "index.html").read_bytes(), "text/html; charset=utf-8")
         if path.startswith("/assets/"):
             return _read_asset(path.removeprefix("/assets/"))
+        if path == "/background":
+            return self._draw_background(query)
         answer = self._answers.get(path)
         return None if answer is None else Reply(encode_json(answer(self, query)).encode())
 
@@ -163,20 +170,25 @@ class Dashboard:
 
     def _describe_map(self, query: Mapping[str, str]) -> dict[str, Any]:
         shown = self.shown
-        width, height = (round(_read_number(query, name, 1.0, MAX_PIXELS)) for name in ("width", "height"))
         with self._source.lock:
             drive = self._source.drive
             picture = drive.get_picture(shown.utime)
-            if "scale" in query:
-                scale = _read_number(query, "scale", 1e-4, MAX_METERS_PER_PIXEL)
-                east, north = (_read_number(query, name, -1e7, 1e7) for name in ("east", "north"))
-                view = View(east, north, scale, width, height)
-            else:
-                view = fit_view(drive, width, height)
+            view = _read_view(query) if "scale" in query else fit_view(drive, *_read_size(query))
             if query.get("follow") and picture.pose is not None:
                 east, north, _ = picture.pose.xyz
                 view = replace(view, east=east, north=north)
-            return describe_map(drive, picture, shown.trail_s, view, shown.places)
+            found = describe_map(drive, picture, shown.trail_s, view, shown.places)
+            origin = drive.origin
+        kind = query.get("grid", "")
+        found["grid"] = make_grid(origin, view, kind) if kind and origin is not None else []
+        found["attribution"] = None if self._background is None else self._background.attribution
+        return found
+
+    def _draw_background(self, query: Mapping[str, str]) -> Reply | None:
+        origin = self._source.drive.origin
+        if self._background is None or origin is None:
+            return None
+        return Reply(self._background.draw(_read_view(query), origin), "image/png")
 
     def _change_time(self, query: Mapping[str, str]) -> dict[str, Any]:
         self._seek(_read_number(query, "at", 0.0, 1e9))
@@ -276,6 +288,16 @@ def _read_number(query: Mapping[str, str], name: str, low: float, high: float) -
     if not low <= value <= high:
         raise ValueError(f"{name} must be a number from {low:g} to {high:g}")
     return value
+
+
+def _read_size(query: Mapping[str, str]) -> tuple[int, int]:
+    width, height = (round(_read_number(query, name, 1.0, MAX_PIXELS)) for name in ("width", "height"))
+    return width, height
+
+
+def _read_view(query: Mapping[str, str]) -> View:
+    east, north = (_read_number(query, name, -1e7, 1e7) for name in ("east", "north"))
+    return View(east, north, _read_number(query, "scale", 1e-4, MAX_METERS_PER_PIXEL), *_read_size(query))
 
 
 def _read_names(query: Mapping[str, str], name: str) -> frozenset[str]:

@@ -30,6 +30,13 @@ MAX_METERS_PER_PIXEL: Final = 2_000.0
 """Beyond this a view is larger than a UTM zone."""
 
 
+MIN_GRID_PX: Final = 80.0
+"""Least distance of the lines of a grid: a label (11 digits of 7 px) fits between two."""
+
+GRID_POINTS: Final = 17
+"""Points of a meridian or parallel in a view: over 100 km a chord of a sixteenth deviates by less than a meter."""
+
+
 @dataclass(frozen=True)
 class View:
     """What a map shows: its center in World:UTM, meters, the meters of a pixel, and its size in pixels."""
@@ -88,6 +95,76 @@ def describe_map(
     if drive.origin is not None:
         found["origin"] = describe_origin(drive.origin, view)
     return found
+
+
+def make_grid(origin: Origin, view: View, kind: str) -> list[dict[str, Any]]:
+    """Return the lines of a grid over a view: "utm", or "geodetic" in degrees; none beyond UTM's range.
+
+    Each is {"label": ..., "is_upright": ..., "points": [[east, north], ...]}, from the west or the south.
+    """
+    west, south, east, north = view.bounds
+    least = MIN_GRID_PX * view.scale
+    if kind == "utm":
+        lines = [
+            (f"{value:.{_count_decimals(least)}f} E", True, [(value - origin.easting, y) for y in (south, north)])
+            for value in _list_steps(origin.easting + west, origin.easting + east, least)
+        ] + [
+            (f"{value:.{_count_decimals(least)}f} N", False, [(x, value - origin.northing) for x in (west, east)])
+            for value in _list_steps(origin.northing + south, origin.northing + north, least)
+        ]
+    else:
+        try:
+            lines = _make_graticule(origin, view)
+        except GeodesyError:
+            return []
+    return [
+        {"label": label, "is_upright": is_upright, "points": [_round(point) for point in points]}
+        for label, is_upright, points in lines
+    ]
+
+
+def _make_graticule(origin: Origin, view: View) -> list[tuple[str, bool, list[tuple[float, float]]]]:
+    """Return parallels and meridians over a view, as `make_grid`. Raises GeodesyError."""
+    geodesy = geodesy_of(origin)
+    west, south, east, north = view.bounds
+    edge = [
+        geodesy.geodetic_from_utm(origin.easting + x, origin.northing + y, 0.0)[:2]
+        for x in np.linspace(west, east, GRID_POINTS).tolist()
+        for y in (south, view.north, north)
+    ]
+    latitudes, longitudes = np.array(edge).T
+    # without a step at 180 degrees
+    middle = longitudes[len(longitudes) // 2]
+    longitudes = middle + np.remainder(longitudes - middle + 180.0, 360.0) - 180.0
+    spans = ((latitudes.min(), latitudes.max()), (longitudes.min(), longitudes.max()))
+    lines = []
+    for number, (low, high) in enumerate(spans):
+        is_upright = number == 1
+        length = (view.width if is_upright else view.height) * view.scale
+        least = MIN_GRID_PX * view.scale * (high - low) / length
+        for value in _list_steps(low, high, least):
+            other = np.linspace(*spans[1 - number], GRID_POINTS).tolist()
+            places = [(each, value) if is_upright else (value, each) for each in other]
+            points = [geodesy.to_relative_utm(geodesy.utm_from_geodetic(a, b, 0.0))[:2] for a, b in places]
+            shown = math.remainder(value, 360.0)
+            side = ("W" if shown < 0.0 else "E") if is_upright else ("S" if shown < 0.0 else "N")
+            lines.append((f"{abs(shown):.{_count_decimals(least)}f}\u00b0 {side}", is_upright, points))
+    return lines
+
+
+def _find_step(least: float) -> float:
+    """Return the smallest of 1, 2 and 5 times a power of ten that is not below `least`."""
+    power: float = 10.0 ** math.floor(math.log10(least))
+    return next(each * power for each in (1.0, 2.0, 5.0, 10.0) if each * power >= least)
+
+
+def _count_decimals(least: float) -> int:
+    return max(0, -math.floor(math.log10(_find_step(least) * (1.0 + 1e-9))))
+
+
+def _list_steps(low: float, high: float, least: float) -> list[float]:
+    step = _find_step(least)
+    return [number * step for number in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
 def _round(values: tuple[float, ...]) -> list[float]:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import viser
@@ -32,6 +32,9 @@ from mstools.view.editor import Editing, Editor
 from mstools.view.page import Actions, Page, escape_markdown, format_table
 from mstools.view.scene import CHI_SQUARE_3, NameLabels, VehicleScene
 from mstools.view.sources import Source, list_coordinates
+
+if TYPE_CHECKING:
+    from mstools.view.background import Background
 
 WORLDS: Final = (names.WORLD_UTM, names.WORLD_ENU, names.ODOM)
 SPEEDS: Final = ("0.25x", "0.5x", "1x", "2x", "5x", "10x", "30x")
@@ -69,7 +72,9 @@ FIX_PERIOD_S: Final = 0.5
 class Viewer:
     """Show a source on a page. `run` draws picture after picture; callbacks of the page are executed between them."""
 
-    def __init__(self, page: Page, source: Source, editing: Editing | None = None):
+    def __init__(
+        self, page: Page, source: Source, editing: Editing | None = None, background: Background | None = None
+    ):
         self._source = source
         self._server = page.server
         self._actions = Actions()
@@ -115,6 +120,7 @@ class Viewer:
             find_frame=self._find_frame,
             hide=lambda bodies, kinds: self._actions.put(partial(self._scene.hide, bodies, kinds)),
             pick=self._pick,
+            background=background,
         )
         page.respond = self._dashboard.respond
 

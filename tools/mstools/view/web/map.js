@@ -4,6 +4,8 @@
 const FIX_COLORS = ["--used", "--rejected", "--monitored", "--undecided"];
 // below this an ellipse is inside its dot, pixels
 const LEAST_ELLIPSE = 3;
+// width and height of a picture of the ground, in those of the map
+const GROUND_SIZE = 1.5;
 
 function createMap(section, fetchJson) {
   const canvas = section.querySelector("canvas");
@@ -18,6 +20,12 @@ function createMap(section, fetchJson) {
   let data = null;
   let isFetching = false;
   let isStale = false;
+  // "", "utm" or "geodetic"
+  let grid = "";
+  // the picture of the ground that is painted, and the one that is asked for: {image, view, size}
+  let ground = null;
+  let asked = null;
+  let isGroundShown = true;
 
   const getSize = () => [canvas.clientWidth, canvas.clientHeight];
 
@@ -37,17 +45,43 @@ function createMap(section, fetchJson) {
     if (isFetching) { isStale = true; return; }
     isFetching = true;
     const query = new URLSearchParams({ width, height });
-    const asked = view;
+    const before = view;
     if (view && !isFitted) for (const [n, name] of ["east", "north", "scale"].entries()) query.set(name, view[n]);
     if (isFollowing && view) query.set("follow", 1);
+    if (grid) query.set("grid", grid);
     try {
       data = await fetchJson(`/map?${query}`);
-      if (asked === view) view = data.view;
+      if (before === view) view = data.view;
       paint();
+      askGround();
     } finally {
       isFetching = false;
       if (isStale) { isStale = false; refresh(); }
     }
+  }
+
+  // one picture at a time, of what is shown when the last one has come, with a margin to move in
+  function askGround() {
+    if (!isGroundShown || data.attribution === null || !data.origin || asked || isCovered()) return;
+    const size = getSize().map((each) => Math.round(each * GROUND_SIZE));
+    const wanted = { view, size, image: new Image() };
+    asked = wanted;
+    const end = (isThere) => {
+      asked = null;
+      if (isThere) ground = wanted;
+      paint();
+      if (isThere) askGround();
+    };
+    wanted.image.onload = () => end(true);
+    wanted.image.onerror = () => end(false);
+    wanted.image.src = `/background?${new URLSearchParams({
+      east: view[0], north: view[1], scale: view[2], width: size[0], height: size[1],
+    })}`;
+  }
+
+  function isCovered() {
+    if (!ground || ground.view[2] !== view[2]) return false;
+    return getSize().every((each, n) => Math.abs(view[n] - ground.view[n]) / view[2] <= (ground.size[n] - each) / 2);
   }
 
   // --- painting
@@ -68,6 +102,8 @@ function createMap(section, fetchJson) {
     pen.setTransform(density, 0, 0, density, 0, 0);
     pen.clearRect(0, 0, width, height);
     pen.font = "11px system-ui, sans-serif";
+    if (isGroundShown && ground) paintGround();
+    for (const line of data.grid) paintLine(line);
     paintFixes();
     pen.lineWidth = 2;
     for (const line of data.trail) {
@@ -79,6 +115,33 @@ function createMap(section, fetchJson) {
     if (data.vehicle) paintVehicle(data.vehicle);
     paintScale();
     describe();
+  }
+
+  // a picture of an earlier view is moved and scaled until the next one comes
+  function paintGround() {
+    const [east, north, scale] = ground.view;
+    const [width, height] = ground.size.map((each) => (each * scale) / view[2]);
+    const [x, y] = toPixels([east, north]);
+    pen.drawImage(ground.image, x - width / 2, y - height / 2, width, height);
+  }
+
+  function paintLine(line) {
+    const [width, height] = getSize();
+    pen.strokeStyle = readTone("--grid");
+    pen.lineWidth = 0.7;
+    trace(line.points);
+    pen.stroke();
+    const places = line.points.map(toPixels);
+    // where the line enters the view: below, or at the left
+    const number = places.findIndex(([x, y]) => (line.is_upright ? y <= height : x >= 0));
+    if (number < 0) return;
+    const [x, y] = places[number];
+    const room = line.is_upright ? [x + 3, height - 34] : [4, y - 3];
+    pen.lineWidth = 3;
+    pen.strokeStyle = readTone("--paper");
+    pen.strokeText(line.label, ...room);
+    pen.fillStyle = readTone("--ink");
+    pen.fillText(line.label, ...room);
   }
 
   function paintFixes() {
@@ -148,6 +211,10 @@ function createMap(section, fetchJson) {
   function describe() {
     canvas.dataset.fixes = data.fixes.length;
     canvas.dataset.meters = view[2];
+    canvas.dataset.grid = data.grid.length;
+    canvas.dataset.ground = ground ? ground.view.join() : "";
+    section.querySelector("[data-do=ground]").hidden = data.attribution === null;
+    section.querySelector(".attribution").textContent = (isGroundShown && data.attribution) || "";
     if (data.vehicle) canvas.dataset.vehicle = toPixels(data.vehicle.at).join(",");
     canvas.setAttribute("aria-label", `North-up map: ${data.fixes.length} fixes`);
   }
@@ -166,14 +233,11 @@ function createMap(section, fetchJson) {
 
   function zoom(factor, x, y) {
     if (!view) return;
-    isFitted = false;
     const before = toPlace(x, y);
     const scale = Math.min(Math.max(view[2] * factor, 1e-3), 1000);
     view = [view[0], view[1], scale];
     const after = toPlace(x, y);
-    view = [view[0] + before[0] - after[0], view[1] + before[1] - after[1], scale];
-    paint();
-    refresh();
+    show([view[0] + before[0] - after[0], view[1] + before[1] - after[1], scale]);
   }
 
   const zoomMiddle = (factor) => zoom(factor, ...getSize().map((each) => each / 2));
@@ -203,10 +267,7 @@ function createMap(section, fetchJson) {
     held.set(event.pointerId, now);
     if (held.size === 1) {
       if (isFollowing) setFollow(false);
-      isFitted = false;
-      view = [view[0] - (now[0] - last[0]) * view[2], view[1] + (now[1] - last[1]) * view[2], view[2]];
-      paint();
-      refresh();
+      show([view[0] - (now[0] - last[0]) * view[2], view[1] + (now[1] - last[1]) * view[2], view[2]]);
     } else {
       // two fingers: the distance to the other one zooms
       const other = [...held].find(([id]) => id !== event.pointerId)[1];
@@ -219,17 +280,27 @@ function createMap(section, fetchJson) {
     const steps = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
     if (event.key === "+") zoomMiddle(0.7);
     else if (event.key === "-") zoomMiddle(1.4);
-    else if (steps && view) {
-      isFitted = false;
-      view = [view[0] + steps[0] * 60 * view[2], view[1] + steps[1] * 60 * view[2], view[2]];
-      refresh();
-    } else return;
+    else if (steps && view) show([view[0] + steps[0] * 60 * view[2], view[1] + steps[1] * 60 * view[2], view[2]]);
+    else return;
     event.preventDefault();
     event.stopPropagation();
   });
   const actions = {
     fit: () => { isFitted = true; setFollow(false); },
     follow: () => setFollow(!isFollowing),
+    grid: () => {
+      grid = { "": "utm", utm: "geodetic", geodetic: "" }[grid];
+      const button = section.querySelector("[data-do=grid]");
+      button.textContent = { "": "Grid", utm: "Grid: UTM", geodetic: "Grid: degrees" }[grid];
+      button.setAttribute("aria-pressed", grid !== "");
+      refresh();
+    },
+    ground: () => {
+      isGroundShown = !isGroundShown;
+      section.querySelector("[data-do=ground]").setAttribute("aria-pressed", isGroundShown);
+      paint();
+      askGround();
+    },
     in: () => zoomMiddle(0.6),
     out: () => zoomMiddle(1 / 0.6),
   };
@@ -237,5 +308,13 @@ function createMap(section, fetchJson) {
     button.addEventListener("click", () => actions[button.dataset.do]());
   new ResizeObserver(() => { paint(); refresh(); }).observe(canvas);
 
-  return { refresh, paint };
+  // shows a place: east, north, meters of a pixel
+  function show(place) {
+    isFitted = false;
+    view = place;
+    paint();
+    refresh();
+  }
+
+  return { refresh, paint, show, toPixels };
 }
