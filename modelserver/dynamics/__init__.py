@@ -4,7 +4,7 @@ Pinocchio, of the extra `dynamics`, does the algebra; it is imported when a `Dyn
 """
 
 from modelserver.dynamics.multibody import STANDARD_GRAVITY, CenterOfMass, Dynamics
-from modelserver.dynamics.stability import Stability, TipOver, assess_stability, compute_tip_over
+from modelserver.dynamics.stability import Stability, TipOver, assess_stability, compute_tip_over, find_contacts
 from modelserver.dynamics.tree import MassUncertainty
 
 __all__ = [
@@ -16,4 +16,5 @@ __all__ = [
     "TipOver",
     "assess_stability",
     "compute_tip_over",
+    "find_contacts",
 ]

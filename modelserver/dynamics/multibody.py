@@ -197,6 +197,22 @@ class Dynamics:
         """The default positions of the joints (n,); 0 for a floating base."""
         return self._default.copy()
 
+    @property
+    def stated_sigmas(self) -> dict[str, float]:
+        """Standard deviations of the coordinates of the joints that the geometry states; nan where it does not.
+
+        A joint without one makes the covariance of what it moves unknown.
+        """
+        moving = {joint.name for joint in self.tree.joints}
+        return {
+            name: sigma
+            for each in self.model.joints.values()
+            if each.joint.mimic is None and each.name in moving
+            for name, sigma in zip(
+                self.model.drives[each.name].names, each.joint.sigma or (math.nan,) * each.joint.count, strict=True
+            )
+        }
+
     def by_name(self, values: npt.ArrayLike) -> dict[str, float]:
         """Return numbers (n,), one for each coordinate, by name."""
         return dict(zip(self.coordinates, np.asarray(values, dtype=float).tolist(), strict=True))

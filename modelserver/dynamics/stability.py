@@ -28,12 +28,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from itertools import chain
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from modelserver.dynamics.multibody import CenterOfMass, Dynamics, Values
 from modelserver.errors import MalformedRequestError
+from modelserver.geometry.model import Model
 from modelserver.geometry.names import format_names
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Array, Vector3
@@ -175,6 +178,13 @@ def compute_tip_over(
     edge = (polygon.names[order[number]], polygon.names[order[(number + 1) % len(order)]])
     loads = compute_loads(polygon, center, force, moment)
     return TipOver(margin, sigma, size * margin, edge, dict(zip(polygon.names, loads.tolist(), strict=True)))
+
+
+def find_contacts(model: Model, patterns: Sequence[str]) -> tuple[str, ...]:
+    """Return the frames that match names or patterns (`Cart:*Wheel`); a pattern that matches none is a name."""
+    frames = [each.full_name for body in model.bodies for each in body]
+    matched = ([name for name in frames if fnmatchcase(name, pattern)] or [pattern] for pattern in patterns)
+    return tuple(dict.fromkeys(chain.from_iterable(matched)))
 
 
 def assess_stability(

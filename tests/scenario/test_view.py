@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -108,6 +109,29 @@ def test_given_a_geometry_file_when_a_joint_is_moved_then_the_picture_and_the_an
     page.get_by_role("tab", name="Query").click()
     wait_until(page, lambda: abs(read_value(page, "pitch") - before) > 5.0)
     assert read_value(page, "pitch") == pytest.approx(get_pitch(), abs=1e-3)
+
+
+def test_given_the_geometry_when_the_ground_is_tilted_then_margin_and_loads_follow(
+    geometry: tuple[Source, Page],
+) -> None:
+    pytest.importorskip("pinocchio", reason="pin has no wheel for this Python")
+    _, page = geometry
+    page.get_by_role("tab", name="Joints").click()
+    page.get_by_text("Dynamics", exact=True).click()
+    page.get_by_label("Center of mass").check()
+
+    def read_load(name: str) -> float:
+        cells = page.get_by_role("row").filter(has_text=f"Raptor:{name}WheelContact").get_by_role("cell")
+        return float(cells.nth(1).inner_text()) if cells.count() > 1 else math.nan
+
+    wait_until(page, lambda: read_load("FrontLeft") > 1000.0)
+    left, right = read_load("FrontLeft"), read_load("FrontRight")
+    assert abs(left - right) < 50.0
+    enter(page, "Tilt: roll (deg)", "15")
+    # a roll lifts the left side
+    wait_until(page, lambda: read_load("FrontLeft") < left - 100.0)
+    assert read_load("FrontRight") > right
+    assert "Raptor:FrontRightWheelContact" in page.get_by_text("Tip-over margin").inner_text()
 
 
 def test_given_a_log_when_it_is_played_and_searched_then_time_and_vehicle_follow(

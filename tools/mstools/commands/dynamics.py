@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from fnmatch import fnmatchcase
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -84,7 +82,7 @@ def command(
             )
         _show(*_query_daemon(frame, floating, equations, npy is not None, url, prefix, timeout), npy, as_json)
         return
-    from modelserver.dynamics import MassUncertainty, assess_stability
+    from modelserver.dynamics import MassUncertainty, assess_stability, find_contacts
     from modelserver.dynamics.stability import DynamicsSettings
     from modelserver.transforms import so3
 
@@ -114,24 +112,13 @@ def command(
         if any(acceleration)
         else None
     )
-    sigma = {
-        name: value
-        for each in geometry.joints.values()
-        if each.joint.mimic is None and each.name in {joint.name for joint in dynamics.tree.joints}
-        # one without a sigma makes that of what it moves unknown
-        for name, value in zip(
-            geometry.drives[each.name].names, each.joint.sigma or (math.nan,) * each.joint.count, strict=True
-        )
-    }
+    sigma = dynamics.stated_sigmas
     q = base | moved
     center: CenterOfMass = dynamics.center_of_mass(q, frame=frame or root, sigma=sigma)
     inertia = dynamics.inertia(q, frame or root)
     data = _describe_mass(center.mass, frame or root, center.position, center.covariance, inertia)
     data |= {"massless": list(dynamics.massless), "cut": list(dynamics.cut)}
-    frames = [each.full_name for body in geometry.bodies for each in body]
-    # a pattern without a wildcard is a name, known or not
-    matched = ([name for name in frames if fnmatchcase(name, pattern)] or [pattern] for pattern in contacts or ())
-    names = list(dict.fromkeys(chain.from_iterable(matched))) or list(known.contacts)
+    names = find_contacts(geometry, contacts or ()) or known.contacts
     if names:
         v = None if a is None else dict[str, float]()
         found = assess_stability(dynamics, q, names, v, a, sigma=sigma)

@@ -265,6 +265,11 @@ class VehicleScene:
         return found
 
     @property
+    def size(self) -> float:
+        """The largest extent of a body's frames, meters."""
+        return self._size
+
+    @property
     def center(self) -> Array:
         """The place of the base frame in the scene (3)."""
         return np.asarray(self._vehicle.position + self._world.position)

@@ -12,6 +12,7 @@ from typing import Final
 from modelserver.client.mirror import LocalPlatform
 from modelserver.client.mirror_state import HISTORY_S, MirrorReceiver, MirrorState
 from modelserver.client.remote import Platform
+from modelserver.dynamics.stability import DynamicsSettings
 from modelserver.errors import RecordingError
 from modelserver.formats.yaml_geometry import ModelSnapshot
 from modelserver.geometry.joint import Joint, coordinate_names
@@ -36,7 +37,7 @@ class Source:
     """A drive and the client that answers queries on it. Read `drive` under `lock`; `close` ends what runs for it.
 
     `meshes` are the folders in which mesh files are looked up; `notes` are what is odd about a log. `set_joints`
-    moves the joints of a geometry file, `set_model` shows it as edited.
+    moves the joints of a geometry file, `set_model` shows it as edited; `dynamics` is the section of its vehicle file.
     """
 
     title: str
@@ -46,6 +47,7 @@ class Source:
     is_live: bool = False
     set_joints: Callable[[Mapping[str, float]], None] | None = None
     set_model: Callable[[Model], None] | None = None
+    dynamics: DynamicsSettings | None = None
     notes: tuple[str, ...] = ()
     lock: threading.Lock = field(default_factory=threading.Lock)
     close: Callable[[], None] = lambda: None
@@ -108,7 +110,8 @@ def open_geometry(
     drive = Drive(keep_geometry=True)
     answers = FilePlatform(model, next((frame.full_name for body in model.bodies for frame in body), ""), f"in {path}")
     meshes = MeshFolders(geometry.resolve().parent, tuple(packages))
-    source = Source(f"{model.name or path.name}", drive, answers, meshes)
+    dynamics = file.config.dynamics if file.config is not None else None
+    source = Source(f"{model.name or path.name}", drive, answers, meshes, dynamics=dynamics)
 
     def set_joints(positions: Mapping[str, float]) -> None:
         answers.set_joints(positions)

@@ -26,6 +26,7 @@ from modelserver.transforms.so3 import Array
 from mstools.edit import GeometryItem, ItemKind
 from mstools.recordings.drive import Drive, DriveEvent, EventKind, Picture
 from mstools.terminal.health import format_body, format_duration
+from mstools.view.balance import BalancePanel
 from mstools.view.camera import ViewCamera
 from mstools.view.dashboard import Dashboard, Shown
 from mstools.view.editor import Editing, Editor
@@ -100,12 +101,14 @@ class Viewer:
             with tabs.add_tab("State"):
                 self._state = StatePanel(gui)
         self._joints: JointsPanel | None = None
+        self._balance: BalancePanel | None = None
         self._editor: Editor | None = None
         if source.set_model is not None:
             if editing is not None:
                 with tabs.add_tab("Edit"):
                     self._editor = Editor(page.server, self._scene, editing, self._actions, source.set_model)
             with tabs.add_tab("Joints"):
+                self._balance = BalancePanel(gui, page.server.scene, source.dynamics)
                 self._joints = JointsPanel(gui, source, self._actions)
         with tabs.add_tab("Display"):
             self._camera.add_controls(gui, self._actions)
@@ -199,6 +202,8 @@ class Viewer:
                 self._scene.show_labels(*named, latest, density)
             center, is_following = self._scene.center, display.follow.value
             self._scene.show(picture, is_following)
+            if self._balance is not None:
+                self._balance.update(picture.joints, self._scene.size)
             if is_following != self._is_following:
                 self._is_following = is_following
                 self._camera.move(self._scene.center - center)
@@ -241,6 +246,8 @@ class Viewer:
         self._query.set_model(model, base_frame)
         if self._joints is not None:
             self._joints.set_model(model)
+        if self._balance is not None:
+            self._balance.set_model(model, base_frame)
         if self._editor is not None:
             self._editor.show_gizmo()
         self._notes.content = describe_unread(self._scene.unread)

@@ -137,11 +137,16 @@ function createMap(section, fetchJson) {
     if (number < 0) return;
     const [x, y] = places[number];
     const room = line.is_upright ? [x + 3, height - 34] : [4, y - 3];
+    paintText(line.label, "--ink", ...room);
+  }
+
+  // text that can be read on a picture
+  function paintText(text, tone, x, y) {
     pen.lineWidth = 3;
     pen.strokeStyle = readTone("--paper");
-    pen.strokeText(line.label, ...room);
-    pen.fillStyle = readTone("--ink");
-    pen.fillText(line.label, ...room);
+    pen.strokeText(text, x, y);
+    pen.fillStyle = readTone(tone);
+    pen.fillText(text, x, y);
   }
 
   function paintFixes() {
@@ -170,7 +175,7 @@ function createMap(section, fetchJson) {
     pen.beginPath();
     pen.arc(x, y, 4, 0, 2 * Math.PI);
     pen.fill();
-    pen.fillText(name, x + 7, y + 12);
+    paintText(name, "--place", x + 7, y + 12);
   }
 
   function paintVehicle(vehicle) {
