@@ -34,7 +34,7 @@ TOOLS = {
     "tuning": {"terminal", "report"},
     "launch": {"terminal"},
     "deployment": {"terminal"},
-    "foxglove": {"terminal", "meshes", "recordings", "shapes"},
+    "foxglove": {"terminal", "meshes", "recordings", "report", "shapes"},
     "view": {"terminal", "edit", "meshes", "recordings", "report", "shapes"},
 }
 SERVER = CORE | WIRE | CONFIG | FILES | SIGNING | {"core", "formats", "yaml_tree"}
