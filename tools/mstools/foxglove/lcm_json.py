@@ -54,7 +54,7 @@ def make_json_type(name: str) -> JsonType | None:
     fields: list[tuple[str, Callable[[Any], object]]] = []
     for field, typename, dimensions in zip(kind.__slots__, kind.__typenames__, kind.__dimensions__, strict=True):
         schema: object = _JSON_TYPES.get(typename)
-        convert = convert_number if schema == "number" else _return_unchanged
+        convert: Callable[[Any], object] = convert_number if schema == "number" else _return_unchanged
         if schema is None:
             nested = None if typename == "byte" else make_json_type(typename.removeprefix("mslcm."))
             if nested is None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from foxglove.messages import (
@@ -120,7 +120,7 @@ class BodyDrawer:
         """Return the entity of a body, which moves with its first frame."""
         frame = body.frames[0]
         to_frame = frame.pose.inverse()
-        drawn: dict[ShapeKind, list[object]] = {kind: [] for kind in ShapeKind}
+        drawn: dict[ShapeKind, list[Any]] = {kind: [] for kind in ShapeKind}
         for drawn_as, shapes in list_drawings(body):
             for shape in shapes:
                 primitive = self._draw_shape(shape, to_frame @ shape.pose, choose_color(shape, drawn_as))
@@ -142,7 +142,8 @@ class BodyDrawer:
     def _draw_shape(self, shape: Shape, place: Pose, rgba: Rgba) -> object:
         pose, color = convert_pose(place), _make_color(rgba)
         if shape.kind is ShapeKind.BOX:
-            return CubePrimitive(pose=pose, size=_make_vector(shape.size), color=color)
+            x, y, z = shape.size
+            return CubePrimitive(pose=pose, size=Vector3(x=x, y=y, z=z), color=color)
         if shape.kind is ShapeKind.CYLINDER:
             radius, length = shape.size
             return _make_cylinder(pose, radius, length, color)
