@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -48,7 +49,7 @@ def command(
     ] = None,
     live: Annotated[bool, option("--live", "Serve the running service to Foxglove by its websocket.")] = False,
     layout: Annotated[
-        Path | None, option("--layout FILE", "Write a layout too, which shows the topics: Foxglove imports it.")
+        Path | None, option("--layout FILE", "Write a layout that shows the topics: Foxglove imports it. Without LOG: it alone.")
     ] = None,
     raw: Annotated[bool, option("--raw/--no-raw", "Include the LCM messages as they are.")] = True,
     decoded: Annotated[bool, option("--decoded/--no-decoded", "Include the LCM messages as JSON.")] = True,
@@ -84,13 +85,21 @@ def command(
       modelserver export imported.lcm drive.mcap -c vehicle.yaml
       modelserver export --live
     """
+    from modelserver.config.vehicle_file import load_config
+
     if live:
         if log is not None or model is not None or config is not None:
             raise typer.BadParameter("excludes LOG, OUT, --model and --config", param_hint="--live")
-    elif log is None or out is None:
-        raise typer.BadParameter("give LOG and OUT, or --live for the running service", param_hint="LOG")
     elif bind != "127.0.0.1" or port != DEFAULT_PORT or math.isfinite(seconds) or url:
         raise typer.BadParameter("goes with --live", param_hint="--bind, --port, --seconds, --url")
+    elif log is None and layout is not None:
+        if model is not None:
+            raise typer.BadParameter("goes with LOG", param_hint="--model")
+        require_extra("foxglove", NEEDS_FOXGLOVE)
+        write_layout(layout, force, "" if config is None else load_config(config).base_frame)
+        return
+    elif log is None or out is None:
+        raise typer.BadParameter("give LOG and OUT, or --live for the running service", param_hint="LOG")
     elif model is not None and config is not None:
         raise typer.BadParameter("goes without --config, whose vehicle file names the geometry", param_hint="--model")
     elif layout is not None and layout.resolve() == out.resolve():
@@ -106,7 +115,7 @@ def command(
     from mstools.commands.replay import open_localized
 
     check_writable(str(out), force)
-    geometry = model if config is None else find_geometry(config)
+    geometry = model if config is None else Path(load_config(config).geometry)
     folder = None if geometry is None else geometry.resolve().parent
     content = Content(prefix, raw, decoded, layout, force, model, folder, packages)
     with open_localized(log, config) as localized:
@@ -141,19 +150,22 @@ class Content:
         return FoxgloveWriter(context, self.prefix, definitions, self.decoded, model, meshes)
 
     def write_layout(self, writer: FoxgloveWriter) -> None:
-        """Write the layout for what the writer has logged. Raises ModelServerError, OSError."""
-        from mstools.foxglove.layout import make_layout
+    """Write the layout for what the writer has logged. Raises ModelServerError, OSError."""
+    from mstools.foxglove.layout import make_layout
 
-        if self.layout is not None:
-            text = make_layout(writer.base_frame, writer.sources, writer.measurements).to_json()
-            write_file(str(self.layout), f"{text}\n", self.replace)
+    if self.layout is not None:
+        text = make_layout(writer.base_frame, writer.sources, writer.measurements).to_json()
+        write_file(str(self.layout), f"{text}\n", self.replace)
 
 
-def find_geometry(config: Path) -> Path:
-    """Return the geometry file of a vehicle file. Raises ConfigError, OSError."""
-    from modelserver.config.vehicle_file import load_config
+def write_layout(
+    path: Path, replace: bool, base_frame: str = "", sources: Collection[str] = (), measurements: Collection[str] = ()
+) -> None:
+    """Write a layout, see `make_layout`. Raises ModelServerError, OSError."""
+    from mstools.foxglove.layout import make_layout
 
-    return Path(load_config(config).geometry)
+    write_file(str(path), f"{make_layout(base_frame, sources, measurements).to_json()}\n", replace)
+    typer.echo(f"{path}: layout")
 
 
 def write_mcap(log: Path, out: Path, content: Content) -> None:

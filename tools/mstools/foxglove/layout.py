@@ -73,7 +73,7 @@ def make_layout(base_frame: str, sources: Collection[str] = (), measurements: Co
 
     Parameters
     ----------
-    base_frame : the frame that the scene follows, by its name in Foxglove; empty where it is not known
+    base_frame : the frame that the scene follows; empty where it is not known
     sources : the sources of fixes
     measurements : the labels of innovations; without any, the panel plots those that come
     """
@@ -116,7 +116,7 @@ def _split(direction: str, *items: tuple[float, Content]) -> SplitContainer:
 def _make_scene(base_frame: str) -> BasePanel:
     return ThreeDeePanel(
         config=ThreeDeeConfig(
-            follow_tf=base_frame or None,
+            follow_tf=names.shorten(base_frame) or None,
             follow_mode="follow-position",
             fixed_frame=names.shorten(WORLD),
             camera_state=ThreeDeeCameraState(

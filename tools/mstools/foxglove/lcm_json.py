@@ -12,7 +12,6 @@ import math
 import struct
 from collections.abc import Callable, Mapping
 from functools import cache
-from io import BytesIO
 from itertools import chain
 from typing import Any, Final, NamedTuple
 
@@ -76,11 +75,10 @@ def decode_to_json(name: str, data: bytes) -> dict[str, object]:
     made = make_json_type(name)
     if made is None:
         raise WireError("malformed", f"{name} holds bytes")
-    stream = BytesIO(data)
     try:
-        message = getattr(mslcm, name).decode(stream)
-        # what lcm-gen does not check: text that ends early, and bytes behind the message
-        if stream.tell() != len(data) or message.encode() != data:
+        message = getattr(mslcm, name).decode(data)
+        # lcm-gen checks neither a text that ends early nor bytes behind the message
+        if message.encode() != data:
             raise WireError("malformed", f"{len(data)} bytes are no {name} as it is encoded")
         return made.convert(message)
     except WireError:

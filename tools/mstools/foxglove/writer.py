@@ -187,8 +187,8 @@ class FoxgloveWriter:
 
     @property
     def base_frame(self) -> str:
-        """The frame whose pose is published, by its name in Foxglove."""
-        return names.shorten(self._drive.base_frame)
+        """The frame whose pose is published."""
+        return self._drive.base_frame
 
     @property
     def sources(self) -> Collection[str]:
