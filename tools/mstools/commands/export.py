@@ -49,7 +49,7 @@ def command(
     ] = None,
     live: Annotated[bool, option("--live", "Serve the running service to Foxglove by its websocket.")] = False,
     layout: Annotated[
-        Path | None, option("--layout FILE", "Write a layout that shows the topics: Foxglove imports it. Without LOG: it alone.")
+        Path | None, option("--layout FILE", "Write a layout for Foxglove that shows the topics; without LOG it alone.")
     ] = None,
     raw: Annotated[bool, option("--raw/--no-raw", "Include the LCM messages as they are.")] = True,
     decoded: Annotated[bool, option("--decoded/--no-decoded", "Include the LCM messages as JSON.")] = True,
@@ -102,14 +102,14 @@ def command(
         raise typer.BadParameter("give LOG and OUT, or --live for the running service", param_hint="LOG")
     elif model is not None and config is not None:
         raise typer.BadParameter("goes without --config, whose vehicle file names the geometry", param_hint="--model")
-    elif layout is not None and layout.resolve() == out.resolve():
-        raise typer.BadParameter("must be another file than OUT", param_hint="--layout")
+    elif layout is not None and layout.resolve() in (log.resolve(), out.resolve()):
+        raise typer.BadParameter("must be another file than LOG and OUT", param_hint="--layout")
     require_extra("foxglove", NEEDS_FOXGLOVE)
     if layout is not None:
         check_writable(str(layout), force)
     packages = tuple(package_path or ())
     if log is None or out is None:
-        content = Content(prefix, raw, decoded, layout, force, packages=packages)
+        content = ExportContent(prefix, raw, decoded, layout, force, packages=packages)
         serve_live(content, bind, port, seconds, url)
         return
     from mstools.commands.replay import open_localized
@@ -117,13 +117,13 @@ def command(
     check_writable(str(out), force)
     geometry = model if config is None else Path(load_config(config).geometry)
     folder = None if geometry is None else geometry.resolve().parent
-    content = Content(prefix, raw, decoded, layout, force, model, folder, packages)
+    content = ExportContent(prefix, raw, decoded, layout, force, model, folder, packages)
     with open_localized(log, config) as localized:
         write_mcap(localized, out, content)
 
 
 @dataclass(frozen=True, slots=True)
-class Content:
+class ExportContent:
     """What is exported: of which channels, with which copies of LCM messages, and a layout for it.
 
     `model` is a geometry file in place of the service's; `folder` and `packages` are where meshes are looked up.
@@ -150,12 +150,9 @@ class Content:
         return FoxgloveWriter(context, self.prefix, definitions, self.decoded, model, meshes)
 
     def write_layout(self, writer: FoxgloveWriter) -> None:
-    """Write the layout for what the writer has logged. Raises ModelServerError, OSError."""
-    from mstools.foxglove.layout import make_layout
-
-    if self.layout is not None:
-        text = make_layout(writer.base_frame, writer.sources, writer.measurements).to_json()
-        write_file(str(self.layout), f"{text}\n", self.replace)
+        """Write the layout for what the writer has logged. Raises ModelServerError, OSError."""
+        if self.layout is not None:
+            write_layout(self.layout, self.replace, writer.base_frame, writer.sources, writer.measurements)
 
 
 def write_layout(
@@ -168,7 +165,7 @@ def write_layout(
     typer.echo(f"{path}: layout")
 
 
-def write_mcap(log: Path, out: Path, content: Content) -> None:
+def write_mcap(log: Path, out: Path, content: ExportContent) -> None:
     """Write the MCAP file of a log, whole or not at all, and its layout.
 
     Raises ModelServerError, RecordingError, OSError.
@@ -209,7 +206,7 @@ def print_notes(writer: FoxgloveWriter) -> None:
         typer.echo(escape(f"modelserver: note: {missing}"), err=True)
 
 
-def serve_live(content: Content, bind: str, port: int, seconds: float, url: str) -> None:
+def serve_live(content: ExportContent, bind: str, port: int, seconds: float, url: str) -> None:
     """Serve the running service until Ctrl-C; write the layout when its geometry is there.
 
     Raises ModelServerError for an address that cannot be used.
