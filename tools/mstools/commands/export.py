@@ -52,7 +52,9 @@ def command(
         Path | None, option("--layout FILE", "Write a layout for Foxglove that shows the topics; without LOG it alone.")
     ] = None,
     raw: Annotated[bool, option("--raw/--no-raw", "Include the LCM messages as they are.")] = True,
-    decoded: Annotated[bool, option("--decoded/--no-decoded", "Include the LCM messages as JSON.")] = True,
+    decoded: Annotated[
+        bool, option("--decoded/--no-decoded", "Include the LCM messages as JSON: half of the file.")
+    ] = True,
     package_path: Annotated[
         list[Path] | None,
         option(

@@ -8,11 +8,11 @@ whose numbers are doubles, as Foxglove's, round integers beyond 2^53.
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Callable, Mapping
 from functools import cache
 from itertools import chain
+from math import isfinite
 from typing import Any, Final, NamedTuple
 
 import mslcm
@@ -89,7 +89,7 @@ def decode_to_json(name: str, data: bytes) -> dict[str, object]:
 
 def convert_number(value: float) -> float | None:
     """Return a number for JSON: None for nan and infinities."""
-    return value if math.isfinite(value) else None
+    return value if isfinite(value) else None
 
 
 def _return_unchanged(value: object) -> object:
@@ -100,6 +100,9 @@ def _make_array_function(convert: Callable[[Any], object], dimensions: int) -> C
     def convert_array(values: Any) -> list[object]:
         for _ in range(dimensions - 1):
             values = chain.from_iterable(values)
-        return list(values) if convert is _return_unchanged else [convert(value) for value in values]
+        if convert is convert_number:
+            # in place, since most of what is exported are arrays of numbers
+            return [value if isfinite(value) else None for value in values]
+        return [convert(value) for value in values]
 
     return convert_array

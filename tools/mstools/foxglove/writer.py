@@ -23,7 +23,6 @@ file takes it.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
@@ -66,6 +65,7 @@ from mstools.foxglove.primitives import (
 from mstools.meshes import MeshFolders
 from mstools.recordings.drive import MAX_CHANNELS, Drive, DriveEvent, EventKind, FramePoses, compute_nis
 from mstools.recordings.pose_signals import compute_signals
+from mstools.report.charts import encode_json
 
 TF_TOPIC: Final = "/tf"
 POSE_TOPIC: Final = "/pose"
@@ -414,8 +414,7 @@ def _check_count(channels: Collection[str]) -> None:
 
 
 def _log_json(channel: Channel, message: Mapping[str, object], now: int) -> None:
-    text = json.dumps(message, allow_nan=False, separators=(",", ":"))
-    channel.log(text.encode(), log_time=now * 1000)
+    channel.log(encode_json(message).encode(), log_time=now * 1000)
 
 
 def _make_time(utime: int) -> dict[str, int]:
