@@ -494,6 +494,23 @@ def test_given_meshes_then_they_are_in_the_file_as_they_stand_in_the_geometry(tm
     assert "--package-path" in reason
 
 
+def test_given_a_geometry_file_then_its_meshes_are_found_and_those_missing_are_named(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, geometry, packages = tmp_path / "drive.mcap", tmp_path / "cart.urdf", tmp_path / "packages"
+    geometry.write_text(GEOMETRY.replace("hull.stl", "package://robot/hull.stl"))
+    (packages / "robot").mkdir(parents=True)
+    trimesh.creation.box().export(packages / "robot" / "hull.stl")
+    assert run(log, out, "--model", geometry) == 0
+    errors = capsys.readouterr().err
+    assert "1 mesh not drawn: package robot not found" in errors
+    assert f"1 mesh not drawn: not found in {tmp_path}; correct the path" in errors
+    assert run(log, out, "--model", geometry, "--package-path", packages, "--force") == 0
+    assert "robot" not in capsys.readouterr().err
+    ((_, scene),) = read(out, MODEL_TOPIC)
+    assert [len(each.models) for each in scene.entities] == [1, 0]
+
+
 def test_given_another_geometry_then_its_shapes_replace_those_before(tmp_path: Path) -> None:
     out = tmp_path / "drive.mcap"
     context = foxglove.Context()
