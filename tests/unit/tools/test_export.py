@@ -22,6 +22,7 @@ import trimesh
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+import mslcm
 from modelserver.formats import load_model, parse_model
 from modelserver.formats.yaml_geometry import ModelSnapshot, encode_snapshot
 from modelserver.messages import Invalid
@@ -575,3 +576,27 @@ def test_given_damaged_messages_then_they_are_counted_and_the_rest_is_exported(l
         assert list(read(out, topic))
     poses = [each for each in recorded[-500:] if each[0] == "POSE"]
     assert len([now for now, _ in read(out, "/pose") if now >= recorded[-500][2]]) >= len(poses)
+
+
+def test_given_numbers_that_no_filter_makes_then_the_file_is_one_that_its_readers_read(
+    log: Path, tmp_path: Path
+) -> None:
+    with LogFile(log) as events:
+        recorded = [event.data for event in events if event.channel == "POSE"][-1]
+    context = foxglove.Context()
+    out = tmp_path / "extreme.mcap"
+    with foxglove.open_mcap(out, context=context):
+        writer = FoxgloveWriter(context)
+        for number, value in enumerate((1e308, -1e308, math.inf, math.nan, -1.0, 5e-324), 1):
+            message = mslcm.pose_transform_t.decode(recorded)
+            message.utime += number * 1_000_000
+            message.covariance = [value] * 36
+            message.horizontal_protection_level = message.heading_protection_level = value
+            writer.feed("POSE", message.encode(), message.utime)
+    assert writer.skipped == 0
+    states = [message for _, message in read(out, "/state")]
+    assert len(states) == len(list(read(out, "/uncertainty"))) == 6
+    assert [each["horizontal_protection_level"] for each in states] == [1e308, -1e308, None, None, -1.0, 5e-324]
+    # of an infinite or unknown covariance nothing is drawn
+    spheres = [len(message.entities[0].spheres) for _, message in read(out, "/uncertainty")]
+    assert spheres == [1, 1, 0, 0, 1, 1]

@@ -177,7 +177,7 @@ def make_uncertainty(picture: Picture, frame: str) -> SceneEntity:
             size = Vector3(x=2.0 * semi_axes[0], y=2.0 * semi_axes[1], z=2.0 * semi_axes[2])
             pose = convert_pose(Pose(picture.pose.xyz, axes.wxyz))
             spheres.append(SpherePrimitive(pose=pose, size=size, color=inner))
-        if math.isfinite(radius):
+        if 0.0 < radius < math.inf:
             cylinders.append(_make_cylinder(convert_pose(Pose(picture.pose.xyz)), radius, DISC_HEIGHT, outer))
     return SceneEntity(
         timestamp=make_timestamp(picture.utime),

@@ -74,8 +74,10 @@ def compute_headings(quaternions: Array) -> Array:
 def compute_sigmas(rows: Array) -> Array:
     """Return the standard deviations of horizontal positions along the worst direction, meters."""
     east, east_north, _, north, *_ = rows[:, COVARIANCE].T
-    middle, half = 0.5 * (east + north), np.hypot(0.5 * (east - north), east_north)
-    found: Array = np.sqrt(np.maximum(middle + half, 0.0))
+    # a log may hold any numbers, and infinite ones are nan here
+    with np.errstate(over="ignore", invalid="ignore"):
+        middle, half = 0.5 * (east + north), np.hypot(0.5 * (east - north), east_north)
+        found: Array = np.sqrt(np.maximum(middle + half, 0.0))
     return found
 
 
