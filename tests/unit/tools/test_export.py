@@ -555,7 +555,8 @@ def test_given_damaged_messages_then_they_are_counted_and_the_rest_is_exported(l
     shuffled = random.Random(46)
     with LogFile(log) as events:
         recorded = [(event.channel, event.data, event.utime) for event in events]
-    geometry = [each for each in recorded if each[0] == "MODEL_SNAPSHOT"][:1]
+    snapshots = [each for each in recorded if each[0] == "MODEL_SNAPSHOT"]
+    geometry = [each for each in snapshots if each[2] == snapshots[0][2]]
     damaged = []
     for channel, data, utime in shuffled.sample(recorded, 600):
         changed = bytearray(data)
@@ -564,14 +565,21 @@ def test_given_damaged_messages_then_they_are_counted_and_the_rest_is_exported(l
             changed[shuffled.randrange(8, len(changed))] = shuffled.randrange(256)
         damaged.append((channel, bytes(changed[: shuffled.randint(8, len(changed))]), utime))
         damaged.append((channel, bytes(changed), utime))
-    odd_times = [(*recorded[0][:2], utime) for utime in (-1, 1 << 62, -(1 << 63), (1 << 63) - 1)]
+    # also one in which the validity changes, which is an event
+    poses = [each for each in recorded if each[0] == "POSE"]
+    late = [*geometry, *poses[:1], *poses[-1:]]
+    odd_times = [(*each[:2], utime) for utime in (-1, 1 << 52, 1 << 62, -(1 << 63), (1 << 63) - 1) for each in late]
     context = foxglove.Context()
     out = tmp_path / "damaged.mcap"
     with foxglove.open_mcap(out, context=context):
         writer = FoxgloveWriter(context)
-        for event in (*geometry, *damaged, *odd_times, *recorded[-500:]):
+        for event in odd_times:
             writer.feed(*event)
-    assert 600 <= writer.skipped <= 1200
+        assert writer.skipped == len(odd_times)
+        for event in (*geometry, *damaged, *recorded[-500:]):
+            writer.feed(*event)
+    assert 600 <= writer.skipped - len(odd_times) <= 1200
+    assert len(list(read(out, MODEL_TOPIC))) == 1
     for topic in find_topics(out):
         assert list(read(out, topic))
     poses = [each for each in recorded[-500:] if each[0] == "POSE"]

@@ -63,7 +63,7 @@ from mstools.foxglove.primitives import (
     make_uncertainty,
 )
 from mstools.meshes import MeshFolders
-from mstools.recordings.drive import MAX_CHANNELS, Drive, DriveEvent, EventKind, FramePoses, compute_nis
+from mstools.recordings.drive import MAX_CHANNELS, MAX_STAMP, Drive, DriveEvent, EventKind, FramePoses, compute_nis
 from mstools.recordings.pose_signals import compute_signals
 from mstools.report.charts import encode_json
 
@@ -83,9 +83,6 @@ RAW_PREFIX: Final = "/lcm/"
 FIX_PERIOD_US: Final = 200_000
 STATIC_PERIOD_US: Final = 5_000_000
 """Time between two messages with all frames: a viewer that jumps to a time has only the last one before it."""
-
-MAX_LOG_TIME: Final = (1 << 64) // 1000
-"""Times of receipt are below this, microseconds: those of MCAP are nanoseconds in 64 bits."""
 
 WORLD: Final = "World:UTM"
 
@@ -211,25 +208,23 @@ class FoxgloveWriter:
 
     def feed(self, channel: str, data: bytes, now: int) -> None:
         """Log what a message received at `now`, microseconds, holds. Raises nothing; `skipped` counts the damaged."""
-        drive = self._drive
-        if not channel.startswith(drive.prefix):
+        if not channel.startswith(self._drive.prefix):
             return
-        if not 0 <= now < MAX_LOG_TIME:
-            self.skipped += 1
-            return
-        self._now = now
-        drive.feed(channel, data, now)
         is_whole = True
         for step in self._steps:
             try:
                 step(channel, data, now)
             except (WireError, GeodesyError, OverflowError):
-                # the last one is a stamp that Foxglove's cannot hold
+                # the last one is a time that Foxglove's or MCAP's cannot hold
                 is_whole = False
         self.skipped += not is_whole
 
     def _log_derived(self, channel: str, data: bytes, now: int) -> None:
+        if not 0 <= now < MAX_STAMP:
+            raise WireError("malformed", f"{now} is no time of receipt")
         drive = self._drive
+        self._now = now
+        drive.feed(channel, data, now)
         name = channel[len(drive.prefix) :]
         if drive.model is not None:
             self._log_geometry(drive.model, now)
