@@ -43,7 +43,7 @@ INVALID_COLORS: Final = (Color(r=0.88, g=0.27, b=0.24, a=0.3), Color(r=0.88, g=0
 """Colors of ellipsoid and disc."""
 
 GLB: Final = "model/gltf-binary"
-"""Media type of glTF's binary form (RFC 6838, registered by Khronos)."""
+"""Media type of glTF's binary form (glTF 2.0, 4.3)."""
 
 Y_UP: Final = Pose.from_rpy((0.0, 0.0, 0.0), roll=-math.pi / 2.0)
 """What is undone by Foxglove, which turns glTF by 90 degrees about x: its y axis is up (glTF 2.0, 3.3), z is here."""
