@@ -21,7 +21,7 @@ EXTRAS: Final = {
     "archive": ("bokeh", "distributed", "fsspec", "pyarrow"),
     "bags": ("rosbags", "mcap"),
     "dynamics": ("pinocchio",),
-    "foxglove": ("foxglove",),
+    "foxglove": ("foxglove", "trimesh"),
     "map": ("rasterio",),
     "report": ("plotly",),
     "view": ("viser",),

@@ -20,11 +20,13 @@ from support_view import record_drive
 
 pytest.importorskip("foxglove", reason="the extra foxglove is not installed: pip install -e '.[foxglove]'")
 
+from mcap.reader import make_reader
 from mcap.records import Schema
 from mcap_protobuf.decoder import DecoderFactory
 from websockets.asyncio.client import connect
 from websockets.typing import Subprotocol
 
+from modelserver.wire.codec import type_name_of
 from modelserver.wire.eventlog import LogFile
 
 pytestmark = pytest.mark.slow
@@ -34,18 +36,20 @@ MESSAGE_DATA = 1
 """Opcode of a message in the protocol: then the subscription, the log time in nanoseconds, and the payload."""
 
 
-async def receive(link: str, topics: set[str]) -> dict[str, Any]:
-    """Subscribe to topics, and return the first message of each."""
+async def receive(link: str, topics: set[str], names: set[str]) -> dict[str, Any]:
+    """Subscribe to topics, and return the first message of each; until all names are advertised."""
+    advertised: set[str] = set()
     found: dict[str, Any] = {}
     known: dict[int, dict[str, Any]] = {}
     async with asyncio.timeout(TIMEOUT_S), connect(link, subprotocols=[PROTOCOL], max_size=None) as link_socket:
         assert json.loads(await link_socket.recv())["op"] == "serverInfo"
-        while set(found) != topics:
+        while set(found) != topics or not names <= advertised:
             data = await link_socket.recv()
             if isinstance(data, str):
                 message = json.loads(data)
                 if message["op"] != "advertise":
                     continue
+                advertised |= {each["topic"] for each in message["channels"]}
                 wanted = [each for each in message["channels"] if each["topic"] in topics]
                 known |= {each["id"]: each for each in wanted}
                 pairs = [{"id": each["id"], "channelId": each["id"]} for each in wanted]
@@ -56,21 +60,36 @@ async def receive(link: str, topics: set[str]) -> dict[str, Any]:
     return found
 
 
+def find_topics(log: Path) -> set[str]:
+    """Return the topics of a log's MCAP file."""
+    out = log.with_suffix(".mcap")
+    subprocess.run([*MODELSERVER, "export", log, out], check=True, timeout=TIMEOUT_S, stdout=subprocess.PIPE)
+    with out.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    return {each.topic for each in summary.channels.values()}
+
+
 def decode_payload(channel: dict[str, Any], payload: bytes) -> Any:
     if channel["encoding"] == "json":
         return json.loads(payload)
+    if channel["encoding"] == "lcm":
+        return payload
     schema = Schema(1, base64.b64decode(channel["schema"]), "protobuf", channel["schemaName"])
     decoder = DecoderFactory().decoder_for("protobuf", schema)
     assert decoder is not None
     return decoder(payload)
 
 
-def test_given_a_running_service_then_a_client_of_the_protocol_receives_frames_pose_and_health(
+def test_given_a_running_service_then_a_client_of_the_protocol_receives_the_topics_of_a_file(
     tmp_path: Path, lcm_url: str
 ) -> None:
-    log = record_drive(tmp_path, 8.0)
+    log, layout = record_drive(tmp_path, 8.0), tmp_path / "layout.json"
+    topics = find_topics(log)
     process = subprocess.Popen(
-        [*MODELSERVER, "export", "--live", "--port", "0", "--url", lcm_url], stdout=subprocess.PIPE, text=True
+        [*MODELSERVER, "export", "--live", "--port", "0", "--url", lcm_url, "--layout", layout],
+        stdout=subprocess.PIPE,
+        text=True,
     )
     stop = threading.Event()
 
@@ -89,7 +108,10 @@ def test_given_a_running_service_then_a_client_of_the_protocol_receives_frames_p
         assert process.stdout is not None
         link = process.stdout.readline().split()[0]
         publisher.start()
-        found = asyncio.run(receive(link, {"/tf", "/pose", "/diagnostics", "/fix/gps"}))
+        wanted = {"/tf", "/pose", "/diagnostics", "/fix/gps", "/state", "/decoded/GPS", "/lcm/GPS"}
+        found = asyncio.run(receive(link, wanted, topics))
+        # what is logged once, for a client that comes later
+        scene = asyncio.run(receive(link, {"/model"}, topics))["/model"]
     finally:
         stop.set()
         publisher.join(TIMEOUT_S)
@@ -100,6 +122,11 @@ def test_given_a_running_service_then_a_client_of_the_protocol_receives_frames_p
     assert found["/tf"].transforms[0].parent_frame_id in ("utm", "Raptor:CG")
     assert found["/diagnostics"]["status"][0]["name"] == "pose"
     assert found["/fix/gps"].latitude == pytest.approx(50.27, abs=0.01)
+    assert found["/decoded/GPS"]["latitude_deg"] == pytest.approx(50.27, abs=0.01)
+    assert type_name_of(found["/lcm/GPS"]) == "gps_t"
+    assert isinstance(found["/state"]["heading_deg"], float)
+    assert len(scene.entities) > 5
+    assert '"followTf":"Raptor:CG"' in layout.read_text()
 
 
 def test_given_a_port_in_use_then_the_error_names_the_option(lcm_url: str) -> None:

@@ -18,8 +18,8 @@ pytest.importorskip("viser", reason="the extra view is not installed: pip instal
 from modelserver.earth.geodesy import geodesy_of
 from mstools.commands.demo import find_vehicle_file
 from mstools.recordings.drive import QUATERNION, Drive
+from mstools.recordings.pose_signals import compute_headings, compute_speeds
 from mstools.view.page import open_page
-from mstools.view.signals import compute_headings, compute_speeds
 from mstools.view.sources import open_geometry, open_log
 from mstools.view.viewer import Viewer
 

@@ -25,6 +25,8 @@ TOOLS = {
     # each imports only those before it
     "terminal": set(),
     "edit": {"terminal"},
+    "meshes": set(),
+    "shapes": set(),
     "recordings": {"terminal"},
     "report": {"terminal"},
     "archive": {"terminal", "recordings", "report"},
@@ -32,7 +34,8 @@ TOOLS = {
     "tuning": {"terminal", "report"},
     "launch": {"terminal"},
     "deployment": {"terminal"},
-    "view": {"terminal", "edit", "recordings", "report"},
+    "foxglove": {"terminal", "meshes", "recordings", "report", "shapes"},
+    "view": {"terminal", "edit", "meshes", "recordings", "report", "shapes"},
 }
 SERVER = CORE | WIRE | CONFIG | FILES | SIGNING | {"core", "formats", "yaml_tree"}
 BELOW_TOOLS = SERVER | DRIVERS | {"server", "client", "simulation", "msdrivers", "extras"}

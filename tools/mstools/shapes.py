@@ -1,4 +1,5 @@
-"""Plain shapes of a vehicle without a drawing, for viewers: wheels, housings, masts, frusta of cameras.
+"""Plain shapes of a vehicle without a drawing, for viewers: wheels, housings, masts, frusta of cameras; and what is
+drawn of a body.
 
 What a sensor sees is translucent, and so for viewers no part of the vehicle: the ground is not below it.
 """
@@ -6,14 +7,16 @@ What a sensor sees is translucent, and so for viewers no part of the vehicle: th
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from enum import StrEnum
 from typing import Any, Final
 
+import numpy as np
 import yaml
 
-from modelserver.geometry.parts import DIMENSIONS, Material, Shape, ShapeKind
+from modelserver.geometry.parts import DIMENSIONS, Body, Material, Shape, ShapeKind
 from modelserver.transforms.pose import Pose
-from modelserver.transforms.so3 import Vector3
+from modelserver.transforms.so3 import Array, Vector3
 
 RUBBER: Final = Material("rubber", (0.2, 0.2, 0.21, 1.0))
 METAL: Final = Material("metal", (0.62, 0.64, 0.67, 1.0))
@@ -27,6 +30,18 @@ PICTURE: Final = Material("picture", (0.25, 0.62, 0.95, 0.15))
 
 EDGE: Final = 0.004
 """Thickness of the edges of a frustum, m: a line at the size of a vehicle."""
+
+
+BODY_COLOR: Final = (108 / 255, 140 / 255, 175 / 255)
+"""sRGB of shapes that state no color."""
+
+BOX_OPACITY: Final = 0.2
+"""Of the box in place of shapes."""
+
+MIN_EXTENT: Final = 0.04
+"""Least edge of the box of a body without shapes, meters."""
+
+Rgba = tuple[float, float, float, float]
 
 
 def make_box(size: Vector3, place: Vector3, material: Material) -> Shape:
@@ -91,3 +106,44 @@ def format_shapes(shapes: Iterable[Shape]) -> list[str]:
         text = yaml.safe_dump(fields, default_flow_style=True, sort_keys=False, width=math.inf).strip()
         lines.append(f"- {text}")
     return lines
+
+
+# --- what is drawn of a body
+
+
+class DrawnAs(StrEnum):
+    """What a body is drawn as, in the order of preference: its visuals, its collision shapes, a box of its frames."""
+
+    VISUAL = "visual"
+    COLLISION = "collision"
+    BOX = "box"
+
+
+def list_drawings(body: Body) -> Iterator[tuple[DrawnAs, tuple[Shape, ...]]]:
+    """Yield what a body may be drawn as; the first of which a viewer can draw a shape is drawn."""
+    yield DrawnAs.VISUAL, body.visuals
+    yield DrawnAs.COLLISION, body.collisions
+    yield DrawnAs.BOX, (make_frame_box(body),)
+
+
+def make_frame_box(body: Body) -> Shape:
+    """Return the box around the frames of a body and its origin."""
+    corners = list_corners(body)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    x, y, z = np.maximum(high - low, MIN_EXTENT).tolist()
+    return Shape(ShapeKind.BOX, (x, y, z), Pose(((low + high) / 2.0).tolist()))
+
+
+def list_corners(body: Body) -> Array:
+    """Return the places of the frames of a body and its origin (n, 3)."""
+    return np.array([(0.0, 0.0, 0.0), *(frame.pose.xyz for frame in body.frames)])
+
+
+def find_color(shape: Shape) -> Rgba | None:
+    """Return the color that a shape states, sRGB and opacity; None without one."""
+    return None if shape.material is None else shape.material.color
+
+
+def choose_color(shape: Shape, drawn_as: DrawnAs) -> Rgba:
+    """Return the color in which a shape is drawn: what it states, or that of all bodies."""
+    return find_color(shape) or (*BODY_COLOR, BOX_OPACITY if drawn_as is DrawnAs.BOX else 1.0)

@@ -32,18 +32,17 @@ from modelserver.wire.eventlog import encode_event
 from mstools.commands.demo import find_vehicle_file
 from mstools.commands.new import TEMPLATES, Device, NewVehicle, make_geometry
 from mstools.commands.view import open_source
+from mstools.meshes import MeshError, MeshFolders
 from mstools.recordings.drive import Picture
+from mstools.recordings.pose_signals import CHI_SQUARE_3, compute_ellipsoid
 from mstools.view.camera import VIEWS, fit_camera, project
-from mstools.view.meshes import MeshError, MeshFolders
 from mstools.view.page import Page, escape_markdown, open_page
 from mstools.view.scene import (
-    CHI_SQUARE_3,
     LABEL_PX,
     MARK_SCALE,
     OUTLINE_SCALE,
     NameLabels,
     VehicleScene,
-    compute_ellipsoid,
 )
 from mstools.view.sources import Source, list_coordinates, open_geometry
 from mstools.view.viewer import describe_answer, describe_unread, format_code

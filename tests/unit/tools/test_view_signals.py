@@ -13,8 +13,9 @@ pytest.importorskip("plotly", reason="the extra view is not installed: pip insta
 
 from modelserver.messages import Invalid
 from mstools.recordings.drive import QUATERNION, Drive
+from mstools.recordings.pose_signals import compute_headings, compute_speeds
 from mstools.report.charts import COLUMNS
-from mstools.view.signals import CHARTS, Span, compute_headings, compute_speeds, make_panels, make_strip
+from mstools.view.signals import CHARTS, Span, make_panels, make_strip
 
 START = 1_750_000_000_000_000
 SPEED, RADIUS = 3.0, 8.0

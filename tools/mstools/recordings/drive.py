@@ -413,10 +413,11 @@ class Drive:
             row = table.find(decision.utime)
             if row >= 0 and table.utimes[row] == decision.utime:
                 table.rows[row, FIX_COLOR] = FixColor.USED if is_reset else FixColor[decision.verdict.name]
-        if not is_reset and decision.dof > 0 and math.isfinite(decision.statistic):
-            name = f"{decision.source} {decision.kind}"
+        normalized = compute_nis(decision)
+        if normalized is not None:
+            name, value = normalized
             if name in self.nis or len(self.nis) < MAX_CHANNELS:
-                self.nis.setdefault(name, Table(1)).append(decision.utime, decision.statistic / decision.dof)
+                self.nis.setdefault(name, Table(1)).append(decision.utime, value)
         if is_reset or decision.verdict is Verdict.REJECTED:
             verb = "reset by" if is_reset else "rejected"
             reason = f": {decision.reason}" if decision.reason else ""
@@ -570,6 +571,13 @@ class Drive:
             rows.append(((stamp - end) * 1e-6, navigation.values[at], math.sqrt(max(variance, 0.0))))
         times, values, sigmas = np.array(rows, float).reshape(-1, 3).T
         return times, values, sigmas
+
+
+def compute_nis(decision: Decision) -> tuple[str, float] | None:
+    """Return source and kind of a measurement, and its NIS per degree of freedom; None where it has none."""
+    if decision.verdict is Verdict.RESET or decision.dof == 0 or not math.isfinite(decision.statistic):
+        return None
+    return f"{decision.source} {decision.kind}", decision.statistic / decision.dof
 
 
 def read_stamp(data: bytes) -> int:

@@ -21,8 +21,8 @@ from modelserver.errors import ModelServerError
 from modelserver.geometry.model import Model
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Array
+from mstools.recordings.pose_signals import CHI_SQUARE_3, compute_ellipsoid
 from mstools.view.page import escape_markdown, format_table
-from mstools.view.scene import CHI_SQUARE_3, compute_ellipsoid
 
 NODE: Final = "/world/vehicle/dynamics"
 CONTACTS: Final = "*Contact"

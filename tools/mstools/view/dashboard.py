@@ -25,25 +25,16 @@ from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
 from modelserver.messages import Health
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Vector3
-from mstools.recordings.drive import QUATERNION, Drive, Picture
+from mstools.recordings.drive import Drive, Picture
+from mstools.recordings.pose_signals import compute_signals
 from mstools.report.charts import encode_json, read_plotly
 from mstools.view.map import MAX_METERS_PER_PIXEL, View, describe_map, fit_view, make_grid
 from mstools.view.page import Reply
 from mstools.view.scene import KINDS
-from mstools.view.signals import (
-    Span,
-    compute_headings,
-    compute_sigmas,
-    compute_speeds,
-    list_charts,
-    make_panels,
-    make_strip,
-)
+from mstools.view.signals import Span, list_charts, make_panels, make_strip
 from mstools.view.sources import Source
 
 if TYPE_CHECKING:
@@ -59,9 +50,6 @@ ASSETS: Final = {
 
 MAX_PIXELS: Final = 8192
 """Largest width and height of a map that is answered."""
-
-SPEED_WINDOW_US: Final = 1_000_000
-"""Time around a picture from which its speed is taken."""
 
 
 @dataclass(frozen=True)
@@ -266,21 +254,12 @@ def _describe_pose(drive: Drive, picture: Picture) -> dict[str, Any]:
     """Return the pose of a picture as the strip shows it."""
     if picture.pose is None:
         return {"valid": None, "reason": "no pose"}
-    table = drive.poses
-    first, last = np.searchsorted(table.utimes, (picture.utime - SPEED_WINDOW_US, picture.utime + SPEED_WINDOW_US))
-    utimes, rows = table.utimes[first:last], table.rows[first:last]
-    here = int(np.searchsorted(utimes, picture.utime, side="right")) - 1
-    level = picture.horizontal_protection_level
-    found = {"valid": not picture.invalid, "reason": picture.invalid.explain() if picture.invalid else ""}
-    if here < 0:
-        return found
-    values = {
-        "speed": float(compute_speeds(utimes, rows)[here]),
-        "heading": float(compute_headings(rows[here : here + 1, QUATERNION])[0]),
-        "sigma": float(compute_sigmas(rows[here : here + 1])[0]),
-        "level": level,
+    values = compute_signals(drive.poses, picture.utime)._asdict() | {"level": picture.horizontal_protection_level}
+    return {
+        "valid": not picture.invalid,
+        "reason": picture.invalid.explain() if picture.invalid else "",
+        **{name: value if math.isfinite(value) else None for name, value in values.items()},
     }
-    return found | {name: value if math.isfinite(value) else None for name, value in values.items()}
 
 
 def _read_number(query: Mapping[str, str], name: str, low: float, high: float) -> float:

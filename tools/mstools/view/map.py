@@ -18,7 +18,7 @@ from modelserver.earth import Origin
 from modelserver.earth.geodesy import GeodesyError, geodesy_of
 from modelserver.transforms.so3 import Array, Vector3
 from mstools.recordings.drive import FIX_COLOR, FIX_POSITION, INVALID, MAX_STAMP, Drive, FixColor, Picture
-from mstools.view.signals import compute_headings
+from mstools.recordings.pose_signals import compute_headings
 
 MAX_FIXES: Final = 3_000
 """Fixes of a view at most, the latest: a page paints them with their ellipses in some 10 ms."""

@@ -33,21 +33,19 @@ from modelserver.geometry.model import Model
 from modelserver.geometry.parts import Body, Shape, ShapeKind
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
+from mstools.meshes import MeshError, MeshFolders
 from mstools.recordings.drive import FramePoses, Picture
+from mstools.recordings.pose_signals import CHI_SQUARE_3, compute_ellipsoid
+from mstools.shapes import DrawnAs, choose_color, find_color, list_corners, list_drawings, make_frame_box
 from mstools.view.camera import choose_labels, project
-from mstools.view.meshes import MeshError, MeshFolders
 
 MAX_TRAIL_POINTS: Final = 4_000
 TRAIL_PERIOD_US: Final = 5_000_000
 MAX_FIXES: Final = 10_000
-MIN_EXTENT: Final = 0.04
-"""Least edge of the box of a body without shapes, meters."""
-
 MIN_WEDGE: Final = 2.0
 """Least length of the lines of the heading's protection level, meters."""
 
 Rgb = tuple[int, int, int]
-BODY_COLOR: Final[Rgb] = (108, 140, 175)
 FIXED_COLOR: Final[Rgb] = (150, 150, 150)
 MOVABLE_COLOR: Final[Rgb] = (240, 150, 40)
 PATH_COLOR: Final[Rgb] = (230, 60, 160)
@@ -56,9 +54,6 @@ VALID_COLOR: Final[Rgb] = (60, 180, 90)
 INVALID_COLOR: Final[Rgb] = (225, 70, 60)
 FIX_COLORS: Final = np.array([VALID_COLOR, INVALID_COLOR, (240, 190, 60), FIXED_COLOR], np.uint8)
 """By `FixColor`."""
-
-CHI_SQUARE_3: Final = {50: 2.366, 68: 3.527, 95: 7.815, 99: 11.345}
-"""Quantiles of chi-square with three degrees of freedom by confidence in percent (NIST e-Handbook, 1.3.6.7.4)."""
 
 LABEL_PX: Final = (6.0, 16.0)
 """Width of a label's character and height of a label in pixels, as viser draws them (measured on a screenshot)."""
@@ -236,7 +231,7 @@ class VehicleScene:
         self._groups |= {"shapes": [], "axes": []}
         self._frames = FramePoses(model, base_frame)
         # the largest extent of a body's frames
-        size = self._size = max([0.5, *(float(np.ptp(_list_corners(body), axis=0).max()) for body in model.bodies)])
+        size = self._size = max([0.5, *(float(np.ptp(list_corners(body), axis=0).max()) for body in model.bodies)])
         orphans = 0
         for number, body in enumerate(model.bodies):
             root = f"/world/vehicle/body/{number}"
@@ -282,14 +277,14 @@ class VehicleScene:
     def _draw_body(self, root: str, body: Body, size: float) -> None:
         points: list[Array] = []
         solid: list[Array] = []
-        for kind, shapes in (("visual", body.visuals), ("collision", body.collisions), ("box", (_make_box(body),))):
+        for kind, shapes in list_drawings(body):
             drawn = [
                 node
                 for number, shape in enumerate(shapes)
                 if (node := self._draw_shape(f"{root}/{kind}/{number}", shape, kind, points, solid)) is not None
             ]
             # what can be clicked hides from the pointer what is behind it: frames in a stand-in box, and the gizmo
-            if kind != "box" and body.frames and not self.is_edited:
+            if kind is not DrawnAs.BOX and body.frames and not self.is_edited:
                 for node in drawn:
                     self._add_pick(node, lambda _: body.frames[0].full_name)
             self._groups["shapes"] += drawn
@@ -323,16 +318,14 @@ class VehicleScene:
         node.on_click(lambda event: self._pick(find_frame(event), False))
         node.on_click(lambda event: self._pick(find_frame(event), True), modifier="shift")
 
-    def _draw_shape(self, name: str, shape: Shape, kind: str, points: list[Array], solid: list[Array]) -> Any:
+    def _draw_shape(self, name: str, shape: Shape, kind: DrawnAs, points: list[Array], solid: list[Array]) -> Any:
         """Draw a shape; None for a mesh that cannot be read.
 
         Its outermost points in the body are appended to `points`, and to `solid` where it is part of the vehicle.
         """
-        stated = shape.material.color if shape.material is not None else None
-        color, opacity = BODY_COLOR, 0.2 if kind == "box" else 1.0
-        if stated is not None:
-            *rgb, opacity = stated
-            color = (round(255 * rgb[0]), round(255 * rgb[1]), round(255 * rgb[2]))
+        stated = find_color(shape)
+        *rgb, opacity = choose_color(shape, kind)
+        color = tuple(round(255 * each) for each in rgb)
         scene = self._scene
         place: dict[str, Any] = {"wxyz": shape.pose.wxyz, "position": shape.pose.xyz}
         look: dict[str, Any] = {"color": color, "opacity": opacity if opacity < 1.0 else None, **place}
@@ -591,19 +584,8 @@ class VehicleScene:
                 self._scene.add_label(f"/world/grid/{i} {k}", text, position=(x, y, 0.0), font_screen_scale=0.6)
 
 
-def _list_corners(body: Body) -> Array:
-    return np.array([(0.0, 0.0, 0.0), *(frame.pose.xyz for frame in body.frames)])
-
-
-def _make_box(body: Body) -> Shape:
-    corners = _list_corners(body)
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    x, y, z = np.maximum(high - low, MIN_EXTENT).tolist()
-    return Shape(ShapeKind.BOX, (x, y, z), Pose(((low + high) / 2.0).tolist()))
-
-
 def _list_shapes(body: Body) -> tuple[Shape, ...]:
-    return body.visuals or body.collisions or (_make_box(body),)
+    return body.visuals or body.collisions or (make_frame_box(body),)
 
 
 def _list_outline(shape: Shape) -> Array:
@@ -617,17 +599,3 @@ def _list_outline(shape: Shape) -> Array:
     circle = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     ends = [np.column_stack([circle, np.full(len(circle), z)]) for z in (-shape.size[1] / 2.0, shape.size[1] / 2.0)]
     return np.concatenate(ends)
-
-
-def compute_ellipsoid(covariance: Array, quantile: float) -> tuple[Vector3, Pose]:
-    """Return the semi-axes in meters and the orientation of the ellipsoid (p - m)' inv(P) (p - m) = quantile.
-
-    `covariance` is P (3, 3), m2. By the eigenvalues of P.
-    """
-    values, vectors = np.linalg.eigh(covariance)
-    if np.linalg.det(vectors) < 0.0:
-        vectors[:, 0] = -vectors[:, 0]
-    x, y, z = (math.sqrt(max(value, 0.0) * quantile) for value in values.tolist())
-    matrix = np.eye(4)
-    matrix[:3, :3] = vectors
-    return (x, y, z), Pose.from_matrix(matrix)

@@ -17,18 +17,13 @@ import numpy.typing as npt
 from modelserver.messages import Invalid
 from modelserver.transforms.so3 import Array
 from modelserver.wire.channels import BY_NAME, ChannelUse
-from mstools.recordings.drive import COVARIANCE, EPOCH, HORIZONTAL, INVALID, QUATERNION, Drive, Table
+from mstools.recordings.drive import EPOCH, HORIZONTAL, INVALID, QUATERNION, Drive, Table
+from mstools.recordings.pose_signals import MAX_GAP_US, compute_headings, compute_sigmas, compute_speeds
 from mstools.report import charts
 from mstools.report.charts import Axis, Panel, Series, StripRow
 
-SPEED_SPAN_US: Final = 400_000
-"""Time over which positions are differenced to a speed: a correction of the pose by 0.1 m is 0.25 m/s then."""
-
 SHOWN_SHARE: Final = 0.995
 """Share of the values that an axis has: a jump of the pose, as at its alignment, would flatten the rest."""
-
-MAX_GAP_US: Final = 1_000_000
-"""Longer gaps between poses interrupt lines and strips."""
 
 LEFT: Final = 170
 """Pixels left of the charts: the names of the reasons, and the same for all, so that times are below one another."""
@@ -118,38 +113,7 @@ def _find_intervals(
     ]
 
 
-# --- values of poses
-
-
-def compute_speeds(utimes: npt.NDArray[np.int64], rows: Array) -> Array:
-    """Return the horizontal speed at each row of poses, m/s: of the positions around it; nan at resets and gaps."""
-    if len(utimes) < 2:
-        return np.full(len(utimes), math.nan)
-    half = SPEED_SPAN_US // 2
-    first = np.searchsorted(utimes, utimes - half)
-    last = np.searchsorted(utimes, utimes + half, side="right") - 1
-    # at a lower rate the neighbors
-    first = np.where(first == last, np.maximum(first - 1, 0), first)
-    seconds = (utimes[last] - utimes[first]) * 1e-6
-    steps = np.linalg.norm(rows[last, :2] - rows[first, :2], axis=1)
-    is_one = (rows[last, EPOCH] == rows[first, EPOCH]) & (seconds > 0.0) & (seconds * 1e6 <= MAX_GAP_US)
-    return np.where(is_one, steps / np.where(seconds > 0.0, seconds, 1.0), math.nan)
-
-
-def compute_headings(quaternions: Array) -> Array:
-    """Return the headings of rotations (n, 4), scalar first: degrees clockwise from grid north, 0 to 360."""
-    w, x, y, z = quaternions.T
-    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    found: Array = np.mod(90.0 - np.degrees(yaw), 360.0)
-    return found
-
-
-def compute_sigmas(rows: Array) -> Array:
-    """Return the standard deviations of horizontal positions along the worst direction, meters."""
-    east, east_north, _, north, *_ = rows[:, COVARIANCE].T
-    middle, half = 0.5 * (east + north), np.hypot(0.5 * (east - north), east_north)
-    found: Array = np.sqrt(np.maximum(middle + half, 0.0))
-    return found
+# --- poses
 
 
 def _interrupt(x: Array, *values: Array, at: npt.NDArray[np.bool_]) -> tuple[Array, ...]:

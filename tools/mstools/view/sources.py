@@ -23,10 +23,10 @@ from modelserver.wire.codec import encode
 from modelserver.wire.eventlog import LogEvent
 from modelserver.wire.provider import open_lcm, resolve_url
 from mstools.edit import EditedFile, EditSession
+from mstools.meshes import MeshFolders
 from mstools.recordings.drive import Drive, follow_bus
 from mstools.recordings.log_platform import LogPlatform, scan_log
 from mstools.terminal.output import load_given_model, read_with_progress
-from mstools.view.meshes import MeshFolders
 
 FILE_UTIME: Final = 10**15
 """Stamp of the first joint positions of a geometry file; each later one is a second later."""

@@ -25,13 +25,14 @@ from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array
 from mstools.edit import GeometryItem, ItemKind
 from mstools.recordings.drive import Drive, DriveEvent, EventKind, Picture
+from mstools.recordings.pose_signals import CHI_SQUARE_3
 from mstools.terminal.health import format_body, format_duration
 from mstools.view.balance import BalancePanel
 from mstools.view.camera import ViewCamera
 from mstools.view.dashboard import Dashboard, Shown
 from mstools.view.editor import Editing, Editor
 from mstools.view.page import Actions, Page, escape_markdown, format_table
-from mstools.view.scene import CHI_SQUARE_3, NameLabels, VehicleScene
+from mstools.view.scene import NameLabels, VehicleScene
 from mstools.view.sources import Source, list_coordinates
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Mesh files of a geometry: where they are, and what the page draws of them.
+"""Mesh files of a geometry: where they are, and what viewers draw of them.
 
 A package URL, `package://NAME/PATH`, is looked up in the folders of --package-path, beside the geometry file and in
 the three folders above it, in ROS_PACKAGE_PATH (ROS 1) and in share/ of AMENT_PREFIX_PATH (ROS 2). A geometry from the
@@ -6,7 +6,7 @@ bus, of a log or the running service, opens only files of these folders: its pub
 
 Colors of DAE, OBJ and others are sRGB, those of glTF are linear (glTF 2.0, 3.9.2). All triangles are double sided, as
 robot descriptions have them wound either way, and none is metallic: a metal shows its surroundings, and there are
-none. Vertices are split where faces meet at an edge: the page draws smooth surfaces across shared ones.
+none. Vertices are split where faces meet at an edge: smooth surfaces are drawn across shared ones.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class MeshError(ValueError):
 
 
 class Mesh(NamedTuple):
-    """A mesh as the page draws it: a GLB file, and its outermost vertices (n, 3) before its scale."""
+    """A mesh as viewers draw it: a GLB file, and its outermost vertices (n, 3) before its scale."""
 
     glb: bytes
     outline: Array
