@@ -3,6 +3,7 @@
 Scene nodes, of which `/world` alone moves with the follow camera (the vehicle then stays at the scene's origin):
 
     /world                      World:UTM
+    /world/place                its origin, without its attitude: uncertainty
     /world/vehicle              the base frame
     /world/vehicle/body/NUMBER  a body: its shapes, the axes and the names of its frames
     /world/vehicle/edges        constraints, a segment each
@@ -143,6 +144,7 @@ class VehicleScene:
         self._poses: dict[str, Pose] = {}
         self._labels: list[NodeLabel] = []
         self._path: tuple[str, ...] = ()
+        self._ends: list[list[list[tuple[str, Vector3]]]] = [[], []]
         self._labeled: tuple[int, int, Origin] | None = None
         self._size = 1.0
         self._points: dict[str, Array] = {}
@@ -176,12 +178,15 @@ class VehicleScene:
         self._trail = self._add_lines("/world/track/trail", TRAIL_COLOR, 3.0)
         self._trail_end = self._add_lines("/world/track/end", TRAIL_COLOR, 3.0)
         self._trail_span = (0, 0)
-        # placed by their positions: a browser moves nodes at once, but draws other lines some pictures later
-        self._level = self._scene.add_frame("/world/protection_level", show_axes=False, visible=False)
-        self._circle = self._add_lines("/world/protection_level/position", VALID_COLOR, 2.0)
+        # what is around the position moves with it, and has its own shape more rarely
+        self._place = self._scene.add_frame("/world/place", show_axes=False, visible=False)
+        self._level = self._scene.add_frame("/world/place/protection_level", show_axes=False, visible=False)
+        self._circle = self._add_lines("/world/place/protection_level/position", VALID_COLOR, 2.0)
         angles = np.linspace(0.0, 2.0 * math.pi, 65)
         self._draw_line(self._circle, np.stack([np.cos(angles), np.sin(angles), np.zeros(65)], axis=1))
-        self._wedge = [self._add_lines(f"/world/protection_level/heading/{n}", VALID_COLOR, 2.0) for n in range(2)]
+        self._wedge = [
+            self._add_lines(f"/world/place/protection_level/heading/{n}", VALID_COLOR, 2.0) for n in range(2)
+        ]
         for side in self._wedge:
             side.points = np.array([[(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)]], np.float32)
         self._edges = (
@@ -201,7 +206,9 @@ class VehicleScene:
         self._gizmo: Any = None
         self._gizmo_count = 0
         self._mark: Any = None
-        self._ellipsoid = self._scene.add_icosphere("/world/ellipsoid", 1.0, VALID_COLOR, opacity=0.25, visible=False)
+        self._ellipsoid = self._scene.add_icosphere(
+            "/world/place/ellipsoid", 1.0, VALID_COLOR, opacity=0.25, visible=False
+        )
 
     def _add_lines(self, name: str, color: Rgb, width: float, points: Array = NO_LINES) -> Any:
         """Add a node of line segments (n, 2, 3), `width` pixels wide."""
@@ -243,7 +250,15 @@ class VehicleScene:
                 self._poses[body.name] = Pose((0.0, -size - orphans * 0.5, 0.0))
                 node.position = self._poses[body.name].xyz
             self._draw_body(root, body, size)
-        self._place_bodies(self._frames, self._frames.compute_bodies())
+        self._ends = [
+            [
+                [(names.split(frame)[0], model.frame(frame).pose.xyz) for frame in (each.from_, each.to)]
+                for each in model.constraints
+                if each.joint.is_movable == is_movable
+            ]
+            for is_movable in (False, True)
+        ]
+        self._place_bodies(self._frames.compute_bodies())
         self.hide(*self._hidden)
         joined = [self._poses[name].transform(self._solid[name]) for name in self._frames.paths]
         self._ground = min((float(each[:, 2].min()) for each in joined if len(each)), default=0.0)
@@ -407,28 +422,26 @@ class VehicleScene:
     def show(self, picture: Picture, follow: bool = True) -> None:
         """Move the vehicle and its joints to those of a picture; the vehicle stays at the origin where `follow`."""
         if self._frames is not None and (moved := self._frames.move_joints(picture.joints)):
-            self._place_bodies(self._frames, moved)
+            self._place_bodies(moved)
         pose = picture.pose or Pose.identity()
         self._vehicle.position, self._vehicle.wxyz = pose.xyz, pose.wxyz
+        self._place.position = pose.xyz
         self._grid.position = (0.0, 0.0, float(pose.transform((0.0, 0.0, self._ground))[2]))
         x, y, z = pose.xyz if follow else (0.0, 0.0, 0.0)
         self._world.position = (-x, -y, -z)
 
-    def _place_bodies(self, frames: FramePoses, poses: Mapping[str, Pose]) -> None:
+    def _place_bodies(self, poses: Mapping[str, Pose]) -> None:
         """Move bodies to their poses in the base frame, and redraw what depends on them."""
         for name, pose in poses.items():
             node = self._bodies[name]
             node.position, node.wxyz = pose.xyz, pose.wxyz
         self._poses.update(poses)
-
-        def locate(frame: str) -> Array:
-            return self._poses[names.split(frame)[0]].transform(frames.model.frame(frame).pose.xyz)
-
-        for is_movable, lines in zip((False, True), self._edges, strict=True):
-            chosen = [each for each in frames.model.constraints if each.joint.is_movable == is_movable]
-            points = [(locate(each.from_), locate(each.to)) for each in chosen]
-            lines.points = np.array(points, np.float32).reshape(-1, 2, 3)
-        self._draw_path()
+        for ends, lines in zip(self._ends, self._edges, strict=True):
+            if not ends or any(body in poses for pair in ends for body, _ in pair):
+                points = [[self._poses[body].transform(place) for body, place in pair] for pair in ends]
+                lines.points = np.array(points, np.float32).reshape(-1, 2, 3)
+        if not poses.keys().isdisjoint(frame.partition(":")[0] for frame in self._path):
+            self._draw_path()
 
     def get_frame_pose(self, frame: str) -> Pose | None:
         """Return the pose of a frame in the base frame as drawn; None for an unknown or world frame."""
@@ -547,15 +560,16 @@ class VehicleScene:
         """Draw the ellipsoid of the position at a confidence, and the protection levels of position and heading."""
         pose, color = picture.pose, INVALID_COLOR if picture.invalid else VALID_COLOR
         radius, heading = picture.horizontal_protection_level, picture.heading_protection_level
-        self._ellipsoid.visible = is_shown and picture.covariance is not None and pose is not None
-        self._level.visible = is_shown and pose is not None and math.isfinite(radius)
+        self._place.visible = is_shown and pose is not None
         if pose is None or not is_shown:
             return
+        self._ellipsoid.visible = picture.covariance is not None
         if picture.covariance is not None:
             self._ellipsoid.scale, axes = compute_ellipsoid(picture.covariance, CHI_SQUARE_3[confidence])
-            self._ellipsoid.position, self._ellipsoid.wxyz, self._ellipsoid.color = pose.xyz, axes.wxyz, color
+            self._ellipsoid.wxyz, self._ellipsoid.color = axes.wxyz, color
+        self._level.visible = math.isfinite(radius)
         if self._level.visible:
-            self._level.position, self._circle.scale = pose.xyz, round(radius, 2)
+            self._circle.scale = round(radius, 2)
             for lines in (self._circle, *self._wedge):
                 lines.colors = np.array(color, np.uint8)
             for sign, side in zip((-1.0, 1.0), self._wedge, strict=True):

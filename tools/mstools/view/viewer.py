@@ -67,6 +67,9 @@ HOVER_DISTANCE: Final = 0.03
 LABEL_PERIOD_S: Final = 0.2
 """Period at which it is decided which names are shown, seconds."""
 
+UNCERTAINTY_PERIOD_S: Final = 0.1
+"""Period at which the shape of the uncertainty follows, seconds; its place does with each picture."""
+
 FIX_PERIOD_S: Final = 0.5
 """Period at which the fixes follow, seconds: all of them are sent to the browser again."""
 
@@ -83,7 +86,7 @@ class Viewer:
         self._model: Model | None = None
         self._is_following = True
         self._named: tuple[NameLabels, tuple[str, str]] | None = None
-        self._next_slider = self._next_state = self._next_fixes = self._next_labels = 0.0
+        self._next_slider = self._next_state = self._next_fixes = self._next_labels = self._next_uncertainty = 0.0
         gui = page.server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         gui.main_panel.dock_right()
@@ -212,8 +215,10 @@ class Viewer:
             if fixes is not None:
                 self._next_fixes = now + FIX_PERIOD_S
                 self._scene.show_fixes(*fixes)
-            confidence = int(display.confidence.value.split()[0])
-            self._scene.show_uncertainty(picture, confidence, display.uncertainty.value)
+            if now >= self._next_uncertainty:
+                self._next_uncertainty = now + UNCERTAINTY_PERIOD_S
+                confidence = int(display.confidence.value.split()[0])
+                self._scene.show_uncertainty(picture, confidence, display.uncertainty.value)
             self._scene.label_grid(picture, origin)
             self._camera.update(is_loaded)
         is_playing = self._time is not None and self._time.is_playing
