@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Final
 
 import numpy as np
@@ -204,14 +205,12 @@ def _list_trail(drive: Drive, utime: int, seconds: float, view: View) -> list[di
     first = int(np.searchsorted(drive.poses.utimes, utimes[0]))
     is_valid = drive.poses.rows[first : first + len(points), INVALID] == 0
     shown = _decimate(points[:, :2], is_valid, view)
-    lines: list[dict[str, Any]] = []
-    for number in shown:
-        place, valid = _round(tuple(points[number, :2].tolist())), bool(is_valid[number])
-        if not lines or lines[-1]["valid"] != valid:
-            # a line begins where the last one ends
-            lines.append({"valid": valid, "points": lines[-1]["points"][-1:] if lines else []})
-        lines[-1]["points"].append(place)
-    return lines
+    places, flags = np.round(points[shown, :2], 3).tolist(), is_valid[shown]
+    breaks = [0, *(np.flatnonzero(np.diff(flags)) + 1).tolist(), len(shown)]
+    # a line begins where the last one ends
+    return [
+        {"valid": bool(flags[begin]), "points": places[max(begin - 1, 0) : end]} for begin, end in pairwise(breaks)
+    ]
 
 
 def _decimate(points: Array, is_valid: npt.NDArray[np.bool_], view: View) -> npt.NDArray[np.intp]:
