@@ -113,7 +113,7 @@ def value_range(values: Iterable[float], share: float = 1.0, min_width: float = 
     low, high = known[cut], known[-1 - cut]
     middle, half = 0.5 * (low + high), max(0.55 * (high - low), 0.5 * min_width)
     if half <= RESOLUTION * abs(middle):
-        half = 0.1 * abs(middle)
+        half = 0.1 * abs(middle) or 0.5
     return middle - half, middle + half
 
 
