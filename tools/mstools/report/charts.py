@@ -156,7 +156,9 @@ def render_map(label: str, x: str, y: str, series: Sequence[Series], heights: tu
 
 
 def render_strip(label: str, x: Axis, rows: Sequence[StripRow], events: Sequence[tuple[float, str]] = ()) -> str:
-    return _render_chart(label, make_strip_figure(x, rows, events), is_over_time=True)
+    figure = make_strip_figure(x, rows, events)
+    _fit_margin(figure["layout"])
+    return _render_chart(label, figure, is_over_time=True)
 
 
 # --- figures of plotly.js
@@ -250,7 +252,8 @@ SMALL = 1e-3
 
 
 def _fit_margin(layout: dict[str, Any]) -> None:
-    """Let the left margin grow with the labels of the y axes."""
+    """Let the left margin be as wide as the labels of the y axes need: a telephone has no room for more."""
+    layout["margin"]["l"] = 8
     for name in layout:
         if name.startswith("yaxis"):
             layout[name]["automargin"] = "width"

@@ -141,7 +141,7 @@ def _describe_main_reason(summary: ValiditySummary) -> tuple[str, str] | None:
 
 
 def _time_axis(data: ReplayData) -> Axis:
-    return Axis("seconds from the log's first event", 0.0, max(data.duration, 1e-3))
+    return Axis("seconds into the log", 0.0, max(data.duration, 1e-3))
 
 
 # --- key figures and findings -------------------------------------------------------------------------------
