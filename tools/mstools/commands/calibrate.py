@@ -49,7 +49,7 @@ LogArgument = Annotated[Path, argument("LOG", "LCM event log.")]
 ChannelOption = Annotated[str, option("--channel NAME", "The unit's channel.")]
 FromOption = Annotated[float, option("--from S", "Start here, seconds into the log.")]
 ToOption = Annotated[float, option("--to S", "End here: seconds into the log.")]
-ConfigOption = Annotated[Path | None, option("--config -c FILE", "The vehicle file, to compare with its values.")]
+ConfigOption = Annotated[Path | None, option("--config -c FILE", "The vehicle file, to compare its values and mount.")]
 PlotOption = Annotated[str, option("--plot HTML", "Write a report for a browser to this file.")]
 OutOption = Annotated[str, option("-o --output YAML", "Write the proposal here, - for standard output.")]
 ForceOption = Annotated[bool, option("--force", "Replace files that exist.")]
@@ -73,9 +73,7 @@ def imu(
     channel: ChannelOption = "IMU",
     begin: FromOption = 0.0,
     end: ToOption = math.inf,
-    config: Annotated[
-        Path | None, option("--config -c FILE", "The vehicle file: compare with its mount and settings.")
-    ] = None,
+    config: ConfigOption = None,
     plot: PlotOption = "",
     output: OutOption = "",
     force: ForceOption = False,

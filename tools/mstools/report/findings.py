@@ -30,7 +30,7 @@ from modelserver.estimation.filter.eskf import chi_square_gate
 from modelserver.messages import Decision, Mode, Verdict
 from modelserver.transforms.so3 import Array
 from mstools.report.replay_data import ReplayData, compare_turn_rates
-from mstools.report.validity import REMEDIES, summarize_validity
+from mstools.report.validity import NO_SAMPLES, summarize_validity
 from mstools.terminal.output import format_count
 
 MOVING_SPEED = 0.3
@@ -510,21 +510,19 @@ def check_gaps(data: ReplayData) -> Iterable[ReportFinding]:
 
 def check_validity(data: ReplayData) -> Iterable[ReportFinding]:
     """Find poses that were invalid for long after the start, and those that were never valid."""
-    if not data.snapshots:
-        reason = "No sample of a configured sensor could be used."
-        advice = "Compare the channels in the log with those in the vehicle file."
-        yield error("There was never a state", reason, advice)
-        return
     found = summarize_validity(data)
-    if math.isnan(found.first_valid):
+    if not data.snapshots:
+        yield error(
+            "There was never a state", "No sample of a configured sensor could be used.", _to_sentence(NO_SAMPLES)
+        )
+    elif math.isnan(found.first_valid):
         reason = f"At the end: {data.snapshots[-1].invalid.explain()}."
-        yield error("The pose was never valid", reason, _to_sentence(REMEDIES[next(iter(found.reasons))]))
+        yield error("The pose was never valid", reason, _to_sentence(found.reasons[0].remedy))
     elif found.is_interrupted:
-        main, *others = found.reasons_after
         yield warning(
             f"The pose was not valid in {found.invalid_after / found.after:.0%} of the time after it first was",
-            f"Mostly: {'; '.join(flag.explain() for flag in (main, *others[:1]))}.",
-            _to_sentence(REMEDIES[main]),
+            f"Mostly: {'; '.join(each.reason for each in found.reasons_after[:2])}.",
+            _to_sentence(found.reasons_after[0].remedy),
         )
 
 

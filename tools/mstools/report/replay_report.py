@@ -33,7 +33,7 @@ from mstools.report.findings import (
     compute_running_nis,
 )
 from mstools.report.replay_data import HOLD_S, ReplayData, StateSample, integrate_distance
-from mstools.report.validity import REMEDIES, ValiditySummary, summarize_validity
+from mstools.report.validity import ValiditySummary, summarize_validity
 from mstools.terminal.health import format_duration
 from mstools.terminal.output import escape, format_count
 
@@ -94,8 +94,8 @@ def format_summary(data: ReplayData, path: str) -> list[str]:
 def make_answer(data: ReplayData) -> tuple[Answer, list[ReportFinding]]:
     """Return the share of the time with a valid pose, the main reason of the rest and its remedy; and the findings.
 
-    Where poses are invalid for long, the remedy is that of the first error, their probable cause. The findings are
-    without those on validity, which the answer has.
+    The first error among the findings is the probable cause of poses that are invalid for long, and its remedy theirs.
+    The findings are without those on validity, which the answer has.
     """
     on_validity = list(check_validity(data))
     found = [each for each in collect_findings(data) if each not in on_validity]
@@ -105,20 +105,18 @@ def make_answer(data: ReplayData) -> tuple[Answer, list[ReportFinding]]:
         headline, tone = f"Never valid in {format_duration(summary.duration)}", Severity.ERROR
     else:
         headline = f"Valid {summary.share:.1%} of {format_duration(summary.duration)}"
-        headline += f", from {format_duration(summary.first_valid)} on"
-        headline += "" if summary.invalid_after else " without interruption"
+        headline += f", from {format_duration(summary.first_valid)} on" if summary.first_valid > HOLD_S else ""
+        is_whole = not summary.reasons_after
+        headline += " without interruption" if is_whole else ""
         tone = min((each.level for each in (*on_validity, *found)), key=list(Severity).index, default=Severity.NOTE)
-        if not found and not summary.invalid_after:
+        if not found and is_whole:
             return Answer("good", f"{headline}; no findings"), found
-    lines = [] if data.snapshots else [f"{each.title}: {each.observation}" for each in on_validity]
-    if reason := _describe_main_reason(summary):
-        lines.append(reason[0])
+    reason = _describe_main_reason(summary)
+    lines = [] if reason is None else [reason[0]]
     if cause is not None:
         kind = "Probable cause" if on_validity else "Main finding"
         lines.append(f"{kind}: {cause.title}. {cause.advice}")
-    elif on_validity:
-        lines.append(f"Remedy: {on_validity[0].advice}")
-    elif reason:
+    elif reason is not None:
         lines.append(f"Remedy: {reason[1]}.")
     return Answer("good" if tone is Severity.NOTE else str(tone), headline, lines), found
 
@@ -128,13 +126,10 @@ def _describe_main_reason(summary: ValiditySummary) -> tuple[str, str] | None:
     reasons, total, when = summary.reasons, summary.invalid, "without a valid pose"
     if summary.is_interrupted:
         reasons, total, when = summary.reasons_after, summary.invalid_after, "not valid after the first valid pose"
-    elif not summary.invalid_after and not math.isnan(summary.first_valid):
-        when += ", all before the first one"
     if not reasons or total <= 0.0:
         return None
-    flag, seconds = next(iter(reasons.items()))
-    share = f"{min(seconds / total, 1.0):.0%} of the {format_duration(total)} {when}"
-    return f"Main reason: {flag.explain()} ({flag.name}), {share}.", REMEDIES[flag]
+    share = f"{min(reasons[0].seconds / total, 1.0):.0%} of the {format_duration(total)} {when}"
+    return f"Main reason: {reasons[0].reason}, {share}.", reasons[0].remedy
 
 
 # --- parts of the page --------------------------------------------------------------------------------------
@@ -255,8 +250,8 @@ def _render_validity(data: ReplayData) -> str:
 def _render_reasons(data: ReplayData) -> str:
     summary = summarize_validity(data)
     rows = [
-        (f"{flag.name}: {flag.explain()}", f"{seconds:.1f}", f"{seconds / summary.duration:.1%}", REMEDIES[flag])
-        for flag, seconds in summary.reasons.items()
+        (each.reason, f"{each.seconds:.1f}", f"{each.seconds / summary.duration:.1%}", each.remedy)
+        for each in summary.reasons
         if summary.duration
     ]
     head = ("reason", "s", "of the log", "remedy")

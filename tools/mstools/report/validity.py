@@ -1,7 +1,8 @@
 """How long the pose of a replay was valid, why it was not, and what to do: the answer of a report. Pure.
 
-A state holds until the next one, for `HOLD_S` at most; time without a state is not valid. The main reason is that of
-most of the time that is not valid. LIMIT_EXCEEDED follows from other reasons, and counts where it is the only one.
+A state holds until the next one, for `HOLD_S` at most; time without a state is not valid, and a reason of its own. The
+first reason is that of most of the time; of equal ones NO_IMU is first, as without an IMU fixes are not used either.
+LIMIT_EXCEEDED follows from other reasons, and counts where it is the only one.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 from modelserver.messages import Invalid
 from mstools.report.replay_data import HOLD_S, ReplayData, StateSample
@@ -35,10 +37,20 @@ REMEDIES: Mapping[Invalid, str] = {
 }
 """What to do about each reason for which a pose is invalid."""
 
+NO_SAMPLES = "compare the channels in the log with those in the vehicle file, and check recorder, bus and devices"
+
 LIMIT = 0.05
 """Share of the time after the first valid pose up to which poses may be invalid without a finding: a gap of a minute in
 a drive of twenty, as below a bridge, is no fault of the vehicle.
 """
+
+
+class InvalidTime(NamedTuple):
+    """Time with a reason for which the pose is invalid: the reason in words, seconds, and the remedy."""
+
+    reason: str
+    seconds: float
+    remedy: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,26 +62,33 @@ class ValiditySummary:
     duration : of the log
     valid : with a valid pose
     first_valid : from the log's first event to the first valid pose, nan without one
-    after, invalid_after : time with a state from then on, and the part of it without a valid pose
-    reasons, reasons_after : time with each reason in the whole log and from then on, longest first
+    reasons, reasons_after : time with each reason in the whole log and after the first valid pose, longest first
     """
 
     duration: float
     valid: float
     first_valid: float
-    after: float
-    invalid_after: float
-    reasons: Mapping[Invalid, float]
-    reasons_after: Mapping[Invalid, float]
+    reasons: tuple[InvalidTime, ...]
+    reasons_after: tuple[InvalidTime, ...]
 
     @property
     def share(self) -> float:
         """Share of the log with a valid pose."""
-        return min(self.valid / self.duration, 1.0) if self.duration > 0.0 else 0.0
+        return self.valid / self.duration if self.duration > 0.0 else 0.0
 
     @property
     def invalid(self) -> float:
-        return max(self.duration - self.valid, 0.0)
+        return self.duration - self.valid
+
+    @property
+    def after(self) -> float:
+        """Time after the first valid pose; nan without one."""
+        return self.duration - self.first_valid
+
+    @property
+    def invalid_after(self) -> float:
+        """The part of `after` without a valid pose."""
+        return self.after - self.valid
 
     @property
     def is_interrupted(self) -> bool:
@@ -79,27 +98,28 @@ class ValiditySummary:
 
 def summarize_validity(data: ReplayData) -> ValiditySummary:
     states = data.snapshots
-    # a drive that begins again, as after a step of the clock, has no time between its states
+    # a state of before a step of the clock backward holds for no time
     held = [min(max(b.t - a.t, 0.0), HOLD_S) for a, b in pairwise(states)]
     held += [min(max(data.duration - each.t, 0.0), HOLD_S) for each in states[-1:]]
     first = next((n for n, each in enumerate(states) if not each.invalid), len(states))
-    bad = sum(seconds for each, seconds in zip(states[first:], held[first:], strict=True) if each.invalid)
-    after = sum(held[first:])
+    first_valid = states[first].t if first < len(states) else math.nan
     return ValiditySummary(
         duration=data.duration,
-        valid=after - bad,
-        first_valid=states[first].t if first < len(states) else math.nan,
-        after=after,
-        invalid_after=bad,
-        reasons=_sum_reasons(states, held),
-        reasons_after=_sum_reasons(states[first:], held[first:]),
+        valid=sum(seconds for each, seconds in zip(states, held, strict=True) if not each.invalid),
+        first_valid=first_valid,
+        reasons=_sum_reasons(states, held, data.duration),
+        reasons_after=_sum_reasons(states[first:], held[first:], data.duration - first_valid),
     )
 
 
-def _sum_reasons(states: Sequence[StateSample], held: Sequence[float]) -> dict[Invalid, float]:
-    reasons: defaultdict[Invalid, float] = defaultdict(float)
-    for each, seconds in zip(states, held, strict=True):
+def _sum_reasons(states: Sequence[StateSample], held: Sequence[float], duration: float) -> tuple[InvalidTime, ...]:
+    seconds: defaultdict[Invalid, float] = defaultdict(float)
+    for each, time in zip(states, held, strict=True):
         for flag in Invalid:
             if flag in each.invalid and (flag is not Invalid.LIMIT_EXCEEDED or each.invalid == flag):
-                reasons[flag] += seconds
-    return dict(sorted(reasons.items(), key=lambda item: -item[1]))
+                seconds[flag] += time
+    order = sorted(seconds, key=lambda flag: flag is not Invalid.NO_IMU)
+    found = [InvalidTime(f"{flag.explain()} ({flag.name})", seconds[flag], REMEDIES[flag]) for flag in order]
+    if (rest := duration - sum(held)) > HOLD_S:
+        found.append(InvalidTime("no sample, or none that could be used", rest, NO_SAMPLES))
+    return tuple(sorted(found, key=lambda each: -round(each.seconds, 1)))
