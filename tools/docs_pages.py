@@ -308,7 +308,8 @@ MARKS: dict[str, Callable[..., str]] = {
 """Tables below a mark in a page, whose further words are the arguments.
 
 `<!-- settings modelserver.config.vehicle_file.LimitsConfig -->`, with `own` for no inherited settings;
-`<!-- constants pose_transform_t NO_FIX JOINT_UNKNOWN -->`; `<!-- channels -->`; `<!-- conventions -->`; `<!-- remedies -->`.
+`<!-- constants pose_transform_t NO_FIX JOINT_UNKNOWN -->`; `<!-- channels -->`; `<!-- conventions -->`;
+`<!-- remedies -->`.
 """
 
 MARK = re.compile(rf"^(<!-- ({'|'.join(MARKS)})\b ?([^>]*?) ?-->)(?:\n(?:(?!<!-- ).*\n)*<!-- end -->)?$", re.MULTILINE)
