@@ -271,10 +271,16 @@ def _make_axis(axis: Axis) -> dict[str, Any]:
             "type": "log",
             "range": [math.log10(axis.low), math.log10(axis.high)],
             "exponentformat": "power",
+            "hoverformat": ".4~r",
         }
     # as numbers: with a prefix (16µ, 4.693742M) a label is no value in the axis's unit. Of very small ones a power
     is_small = max(abs(axis.low), abs(axis.high)) < SMALL
-    form = {"exponentformat": "power" if is_small else "none"}
+    # values below the pointer have digits for a thousandth of the axis, at least
+    decimals = 3 - math.floor(math.log10(axis.high - axis.low)) if axis.high > axis.low else 6
+    form = {
+        "exponentformat": "power" if is_small else "none",
+        "hoverformat": ".6~g" if is_small else f".{max(decimals, 0)}~f",
+    }
     return title | form | {"range": [axis.low, axis.high], "zeroline": False}
 
 

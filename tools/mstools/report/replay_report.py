@@ -128,7 +128,7 @@ def _describe_main_reason(summary: ValiditySummary) -> tuple[str, str] | None:
         reasons, total, when = summary.reasons_after, summary.invalid_after, "not valid after the first valid pose"
     if not reasons or total <= 0.0:
         return None
-    share = f"{min(reasons[0].seconds / total, 1.0):.0%} of the {format_duration(total)} {when}"
+    share = f"{reasons[0].seconds / total:.0%} of the {format_duration(total)} {when}"
     return f"Main reason: {reasons[0].reason}, {share}.", reasons[0].remedy
 
 

@@ -119,7 +119,9 @@ def _sum_reasons(states: Sequence[StateSample], held: Sequence[float], duration:
             if flag in each.invalid and (flag is not Invalid.LIMIT_EXCEEDED or each.invalid == flag):
                 seconds[flag] += time
     order = sorted(seconds, key=lambda flag: flag is not Invalid.NO_IMU)
-    found = [InvalidTime(f"{flag.explain()} ({flag.name})", seconds[flag], REMEDIES[flag]) for flag in order]
+    found = [
+        InvalidTime(f"{flag.explain()} ({flag.name})", min(seconds[flag], duration), REMEDIES[flag]) for flag in order
+    ]
     if (rest := duration - sum(held)) > HOLD_S:
         found.append(InvalidTime("no sample, or none that could be used", rest, NO_SAMPLES))
     return tuple(sorted(found, key=lambda each: -round(each.seconds, 1)))
