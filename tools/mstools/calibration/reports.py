@@ -260,7 +260,8 @@ def _render_allan_chart(
     for words, (N, K), color in (("now", now, charts.ORANGE), ("proposed", proposed, charts.BLUE)):
         model = np.sqrt(N**2 / taus + K**2 * taus / 3.0)
         lines.append(Series(f"settings {words}", taus, model, color, shape="dashes"))
-        ratios.append(Series(words, taus, noisiest / model, color))
+        # a setting of 0 has no ratio
+        ratios.append(Series(words, taus, noisiest / np.where(model > 0.0, model, np.nan), color))
     y = charts.decade_axis(f"Allan deviation, {unit}", [value for line in lines for value in line.y])
     floors = [each.figures.instability.value for each in axes if each.figures.instability is not None]
     if floors:

@@ -1,9 +1,8 @@
 """Charts that one can touch, and an HTML page for them: one file that opens without internet.
 
 A chart is a figure of plotly.js as JSON; the library's script is in the page, compressed (`page.js` draws the figures,
-links their time axes and shows one time on all of them). Lines and bands are decimated
-to at most four points in each of `COLUMNS` (first, lowest, highest, last) and dots to one per cell, so that the page
-stays small for a long recording.
+links their time axes and shows one time on all of them). Lines and bands are decimated to at most four points in each
+of `COLUMNS` (first, lowest, highest, last) and dots to one per cell, so that the page stays small for a long recording.
 """
 
 from __future__ import annotations
@@ -323,7 +322,7 @@ def _make_trace(points: Array) -> dict[str, Any]:
 def _encode(values: Array) -> dict[str, str]:
     """Return numbers as plotly.js reads them: in base64, nan interrupts a line.
 
-    In single precision where that rounds by less than 1e-4 of their range, half a pixel of a screen.
+    In single precision where that rounds by less than 1e-4 of their range, a tenth of a pixel of `WIDTH`.
     """
     numbers = np.where(np.isfinite(values), values, np.nan)
     known = numbers[np.isfinite(numbers)]

@@ -29,8 +29,8 @@ REMEDIES: Mapping[Invalid, str] = {
     Invalid.LIMIT_EXCEEDED: "restore GPS, or raise horizontal_limit or heading_limit if your task allows it",
     Invalid.CLOCK_STEPPED: "drive until the heading is known; do not set clocks while driving",
     Invalid.TILTED: "check the mount of the IMU in the geometry",
-    Invalid.GNSS_INCONSISTENT: "fixes drift, jump, or alternate between two receivers; or gyro or wheels drift: "
-    "compare fixes and track in the report; it ends with agreement",
+    Invalid.GNSS_INCONSISTENT: "compare fixes and track in the report: fixes drift, jump, or alternate between two "
+    "receivers, or gyro or wheels drift; it ends with agreement",
     Invalid.MISMOUNTED: "correct the mount of the IMU (modelserver calibrate imu), or the signs of the wheels",
     Invalid.STALE_JOINT: "check the driver of the joint, or give the joint a default",
     Invalid.JOINT_UNKNOWN: "check the driver of the joint, or give the joint a default",
