@@ -267,6 +267,9 @@ def test_given_a_frozen_unit_when_calibrated_then_nothing_is_proposed(tmp_path: 
     assert "all values are equal" in words
     assert not out.exists()
     assert len(read_figures(page)) == 2
+    headline, why, *_ = read_answer(page)
+    assert headline == "Nothing is proposed"
+    assert why.startswith("No figure follows from 70 s: the samples are frozen")
 
 
 # --- the magnetometer ---------------------------------------------------------------------------------------
