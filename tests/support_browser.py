@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import pytest
 
@@ -69,13 +69,20 @@ def start_browser() -> Iterator[Browser]:
 
 @contextmanager
 def open_link(
-    browser: Browser, link: str, sharpness: float = 0.5, expected_errors: tuple[str, ...] = ()
+    browser: Browser,
+    link: str,
+    sharpness: float = 0.5,
+    expected_errors: tuple[str, ...] = (),
+    width: int = WIDTH,
+    is_dark: bool = False,
 ) -> Iterator[Page]:
     """Open a link in a page without cookies of others; errors of its console fail the test, but for expected ones.
 
     `sharpness`: pixels along each side of the viewer's scene, not of its panels, relative to those of the page.
+    `is_dark`: whether the system prefers dark colors.
     """
-    page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+    scheme: Literal["dark", "light"] = "dark" if is_dark else "light"
+    page = browser.new_page(viewport={"width": width, "height": HEIGHT}, color_scheme=scheme)
     page.add_init_script(FEWER_PICTURES)
     page.set_default_timeout(TIMEOUT_MS)
     errors: list[str] = []

@@ -44,11 +44,11 @@ def write_simulated_log(folder: Path, seconds: float, **models: Any) -> tuple[Pa
     return write_log(folder / "drive.lcm", events), RAPTOR
 
 
-def write_raw_mode_vehicle(vehicle: Path, folder: Path) -> Path:
-    """Write a copy of a vehicle file with raw mode; return its path."""
+def write_vehicle(vehicle: Path, folder: Path, localization: dict[str, Any]) -> Path:
+    """Write a copy of a vehicle file with other keys in its section localization; return its path."""
     content = yaml.safe_load(vehicle.read_text(encoding="utf-8"))
     content["geometry"] = str((vehicle.parent / content["geometry"]).resolve())
-    content.setdefault("localization", {})["mode"] = "raw"
+    content.setdefault("localization", {}).update(localization)
     path = folder / "vehicle.yaml"
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
     return path

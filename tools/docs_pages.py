@@ -265,6 +265,19 @@ def channels_table() -> str:
     return table(("channel", "type", "publisher", "rate", "content"), rows)
 
 
+# --- remedies ---------------------------------------------------------------------------------------------------------
+
+
+def remedies_table() -> str:
+    """Return what to do about each reason of an invalid pose as Markdown; reasons with one remedy share a row."""
+    from mstools.report.validity import REMEDIES
+
+    names: dict[str, list[str]] = {}
+    for flag, remedy in REMEDIES.items():
+        names.setdefault(remedy, []).append(f"`{flag.name}`")
+    return table(("reason", "remedy"), [(", ".join(each), remedy) for remedy, each in names.items()])
+
+
 # --- conventions ------------------------------------------------------------------------------------------------------
 
 
@@ -290,11 +303,13 @@ MARKS: dict[str, Callable[..., str]] = {
     "constants": constants_table,
     "channels": channels_table,
     "conventions": conventions_list,
+    "remedies": remedies_table,
 }
 """Tables below a mark in a page, whose further words are the arguments.
 
 `<!-- settings modelserver.config.vehicle_file.LimitsConfig -->`, with `own` for no inherited settings;
-`<!-- constants pose_transform_t NO_FIX JOINT_UNKNOWN -->`; `<!-- channels -->`; `<!-- conventions -->`.
+`<!-- constants pose_transform_t NO_FIX JOINT_UNKNOWN -->`; `<!-- channels -->`; `<!-- conventions -->`;
+`<!-- remedies -->`.
 """
 
 MARK = re.compile(rf"^(<!-- ({'|'.join(MARKS)})\b ?([^>]*?) ?-->)(?:\n(?:(?!<!-- ).*\n)*<!-- end -->)?$", re.MULTILINE)

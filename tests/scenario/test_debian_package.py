@@ -105,8 +105,8 @@ def test_given_the_package_then_every_module_finds_what_it_needs(package: Path) 
 USE_EXTRAS = """
 import foxglove, rosbags.highlevel, mcap.reader, viser, websockets, trimesh
 from modelserver.extras import describe_missing, make_install_command
-from mstools.report.charts import render_text_page
-assert len(render_text_page("a", ["b"], [])) > 1e6
+from mstools.report.charts import render_page
+assert len(render_page("a", "b")) > 1e6
 viser.ViserServer(host="127.0.0.1", port=0, verbose=False).stop()
 print(describe_missing())
 """

@@ -9,7 +9,7 @@ import pytest
 from modelserver.transforms import so3
 from modelserver.transforms.so3 import Quaternion, Vector3
 from mstools.calibration import CalibrationError
-from mstools.commands.calibrate import MAX_TILT, aligned_rotations, axis_name, check_mount
+from mstools.calibration.mount import MAX_TILT, aligned_rotations, check_mount, name_axis
 
 
 def create_mount(*rpy_deg: float) -> Quaternion:
@@ -110,5 +110,5 @@ def test_given_no_gravity_then_it_is_rejected(force: Vector3) -> None:
 
 
 def test_given_directions_then_the_names_of_their_axes_are_returned() -> None:
-    assert axis_name((0.1, -0.9, 0.2)) == "-y"
-    assert axis_name((0.0, 0.0, 1.0)) == "+z"
+    assert name_axis((0.1, -0.9, 0.2)) == "-y"
+    assert name_axis((0.0, 0.0, 1.0)) == "+z"

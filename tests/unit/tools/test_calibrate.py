@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import html
 import math
 import os
 import re
@@ -11,16 +11,18 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 from support_recordings import HUSKY, LATENCY, START, write_log
+from support_report import read_answer, read_figures, read_numbers
+from support_tuning import write_vehicle
 
 from modelserver.messages import FixType, GpsSample, ImuSample, SensorHeader
 from modelserver.wire.codec import encode
 from mstools import cli
+from mstools.calibration.ellipsoid import fit_level
 from mstools.report import charts
 
 Run = Callable[..., tuple[int, str, str]]
@@ -95,13 +97,6 @@ def turning_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return log_of(tmp_path_factory.mktemp("calibrate") / "turned.lcm", rotated_samples())
 
 
-def read_figures(page: Path) -> list[dict[str, Any]]:
-    """Return the figures of a page."""
-    return [
-        json.loads(each) for each in re.findall(r'<script type="application/json">(.*?)</script>', page.read_text())
-    ]
-
-
 # --- the unit's noise ---------------------------------------------------------------------------------------
 
 
@@ -157,9 +152,37 @@ def test_given_a_plot_and_a_proposal_when_calibrated_then_both_files_are_whole(
     assert "# gyro_bias_walk: not determined" in proposal.read_text()
     gyro, accelerometer = read_figures(page)
     for figure in (gyro, accelerometer):
-        assert {"x", "y", "z", "noise / √τ"} <= {each["name"] for each in figure["data"]}
+        assert {"x", "y", "z", "settings now", "settings proposed", "now"} <= {each["name"] for each in figure["data"]}
         assert figure["layout"]["xaxis"]["title"]["text"] == "averaging time τ, s"
         assert figure["layout"]["xaxis"]["type"] == figure["layout"]["yaxis"]["type"] == "log"
+    headline, noise, walk, force, _ = read_answer(page)
+    assert headline == "2 of 4 noise settings determined, no change is needed"
+    assert re.fullmatch(r"gyro_noise: 0\.001 -> 0\.000\d+ \+- [\d.e-]+ rad/s/sqrt\(Hz\): no significant change", noise)
+    assert re.fullmatch(r"gyro_bias_walk: not determined: no rise .*; record 10 minutes or more .*", walk)
+    assert "no change, as the measured value is of the stationary unit" in force
+
+
+def test_given_a_vehicle_file_with_other_values_when_calibrated_then_the_page_begins_with_the_change_and_its_remedy(
+    stationary_log: Path, tmp_path: Path, run: Run
+) -> None:
+    vehicle = write_vehicle(HUSKY, tmp_path, {"filter": {"gyro_noise": 0.004}})
+    page = tmp_path / "allan.html"
+    assert run("imu", stationary_log, "-c", vehicle, "--plot", page)[0] == 0
+    headline, change, *lines = read_answer(page)
+    assert headline == "2 of 4 noise settings determined, 1 to change"
+    assert re.fullmatch(
+        r"gyro_noise: 0\.004 -> 0\.000\d+ \+- [\d.e-]+ rad/s/sqrt\(Hz\): set: the change is significant", change
+    )
+    assert any(each.startswith("Remedy: merge the lines below") for each in lines)
+    assert "the mount is consistent" in lines[-1]
+    # what to merge is the change alone
+    text = page.read_text()
+    merged = yaml.safe_load(html.unescape(text.partition("<pre>")[2].partition("</pre>")[0]))
+    assert list(merged["localization"]["filter"]) == ["gyro_noise"]
+    # the ratio of measured to configured deviation is 1/4 now, and 1 as proposed
+    ratios = {each["name"]: read_numbers(each["y"]) for each in read_figures(page)[0]["data"]}
+    assert ratios["now"][:5] == pytest.approx(0.25, rel=0.05)
+    assert ratios["proposed"][:5] == pytest.approx(1.0, rel=0.05)
 
 
 def test_given_a_file_that_exists_when_calibrated_then_it_is_not_overwritten_unless_forced(
@@ -244,6 +267,9 @@ def test_given_a_frozen_unit_when_calibrated_then_nothing_is_proposed(tmp_path: 
     assert "all values are equal" in words
     assert not out.exists()
     assert len(read_figures(page)) == 2
+    headline, why, *_ = read_answer(page)
+    assert headline == "Nothing is proposed"
+    assert why.startswith("No figure follows from 70 s: the samples are frozen")
 
 
 # --- the magnetometer ---------------------------------------------------------------------------------------
@@ -287,8 +313,41 @@ def test_given_a_plot_and_a_proposal_when_calibrated_then_before_and_after(
     settings = yaml.safe_load(proposal.read_text())["localization"]["magnetometer"]
     assert settings["hard_iron"][:2] == pytest.approx(HARD[:2], abs=3e-8)
     assert len(settings["soft_iron"]) == 9
-    (figure,) = read_figures(page)
-    assert [each["name"] for each in figure["data"]] == ["measured", "calibrated", "mean radius"]
+    residuals, field = read_figures(page)
+    assert [each["name"] for each in field["data"]] == ["measured", "calibrated", "mean radius"]
+    errors, before, after = (read_numbers(each["y"]) for each in residuals["data"] if each["mode"] == "markers")
+    # the vehicle's own field across the earth's turns heading by asin(9.4 / 20.5)
+    assert max(abs(errors)) == pytest.approx(math.degrees(math.asin(math.hypot(*HARD[:2]) / 20.5e-6)), rel=0.02)
+    assert max(abs(before)) == pytest.approx(1e6 * math.hypot(*HARD[:2]), rel=0.1)
+    assert max(abs(after)) < 0.5
+    headline, hard, *_, last = read_answer(page)
+    assert headline.startswith("Heading is wrong by up to 27.")
+    assert hard.startswith("hard_iron, µT: [0.000, 0.000, 0.000] -> [5.0")
+    assert "--place" in last
+
+
+def test_given_the_vehicle_file_has_the_correction_when_calibrated_then_no_change_is_significant(
+    turning_log: Path, tmp_path: Path, run: Run
+) -> None:
+    proposal, page = tmp_path / "magnetometer.yaml", tmp_path / "circle.html"
+    assert run("magnetometer", turning_log, "--place", PLACE, "-o", proposal)[0] == 0
+    vehicle = write_vehicle(HUSKY, tmp_path, yaml.safe_load(proposal.read_text())["localization"])
+    assert run("magnetometer", turning_log, "--place", PLACE, "-c", vehicle, "--plot", page)[0] == 0
+    (headline,) = read_answer(page)
+    assert re.fullmatch(r"No significant change; the error of heading is 0\.\d+ degrees rms", headline)
+
+
+def test_given_many_turns_when_fitted_then_the_results_scatter_by_their_sigma() -> None:
+    chance = np.random.default_rng(3)
+    yaw = np.linspace(0.0, 4.0 * np.pi, 400, endpoint=False)
+    circle = np.column_stack([20e-6 * np.cos(yaw), 20e-6 * np.sin(yaw), np.full(400, -45e-6)])
+    fits = [
+        fit_level(circle + chance.normal(0.0, 2e-7, circle.shape), (0.0, 0.0, 9.8), 20e-6, -45e-6) for _ in range(100)
+    ]
+    # Tukey's weights cost 5 %, and the sigma of 100 values is known to 7 %
+    hard, soft = (np.std([getattr(each, name)[0] for each in fits]) for name in ("hard_iron", "soft_iron"))
+    assert hard == pytest.approx(fits[0].hard_iron_sigma, rel=0.25)
+    assert soft == pytest.approx(fits[0].soft_iron_sigma, rel=0.25)
 
 
 def test_given_a_quarter_turn_when_calibrated_then_it_reports_what_was_seen(tmp_path: Path, run: Run) -> None:

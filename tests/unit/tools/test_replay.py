@@ -28,7 +28,7 @@ from support_recordings import (
     write_log,
 )
 from support_samples import ScriptedLocalizer
-from support_tuning import write_raw_mode_vehicle
+from support_tuning import write_vehicle
 
 from modelserver import core
 from modelserver.core import CoreSettings, CoreState, Instant
@@ -314,7 +314,7 @@ def test_given_a_ledger_on_standard_output_then_only_that_goes_there(
 def test_given_raw_mode_then_the_ledger_is_empty_and_the_poses_are_the_same(
     short_log: Path, tmp_path: Path, run: Run
 ) -> None:
-    config = write_raw_mode_vehicle(HUSKY, tmp_path)
+    config = write_vehicle(HUSKY, tmp_path, {"mode": "raw"})
     for name, options in (("one.csv", ("--decisions", tmp_path / "ledger.jsonl")), ("two.csv", ())):
         assert run(short_log, "-c", config, "--poses", tmp_path / name, *options)[0] == 0
     assert (tmp_path / "ledger.jsonl").read_text() == ""

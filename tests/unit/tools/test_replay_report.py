@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import re
 from collections.abc import Callable
@@ -13,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 from support_recordings import HUSKY, drive, write_log
-from support_tuning import write_raw_mode_vehicle, write_simulated_log
+from support_report import read_answer, read_numbers
+from support_tuning import write_simulated_log, write_vehicle
 
 from benchmarks.rough_simulation import EncoderModel
 from modelserver import extras
@@ -90,6 +90,12 @@ def test_given_a_drive_when_reported_then_the_page_is_whole_and_the_swapped_whee
     for text in ("Wheel front_left counts backward", "gps_position, east, m", "Gyro bias", "Wheel scale", "fixes used"):
         assert text in page
     assert "phase aligned" in page
+    # the answer is first, on the page and in the terminal
+    answer = read_answer(out)
+    assert re.fullmatch(r"Valid \d\d\.\d% of 25\.0 s, from \d\.\d s on without interruption", answer[0])
+    assert "Main finding: Wheel front_left counts backward. Reverse the sign of this wheel" in answer[-1]
+    printed = words.splitlines()
+    assert printed[1 : 1 + len(answer)] == [answer[0], *(f"  {each}" for each in answer[1:])]
 
 
 @pytest.mark.slow
@@ -108,7 +114,7 @@ def test_given_a_report_beside_poses_and_decisions_then_these_are_as_without_it(
 
 @pytest.mark.slow
 def test_given_raw_mode_then_there_is_a_page_without_innovations(tmp_path: Path, run: Run) -> None:
-    config = write_raw_mode_vehicle(HUSKY, tmp_path)
+    config = write_vehicle(HUSKY, tmp_path, {"mode": "raw"})
     log = write_log(tmp_path / "drive.lcm", drive(20.0))
     assert run(log, "-c", config, "--report", tmp_path / "r.html")[0] == 0
     assert "No innovations" in whole((tmp_path / "r.html").read_text())
@@ -118,8 +124,12 @@ def test_given_a_log_without_fixes_then_the_page_has_no_pose(tmp_path: Path, run
     log = write_log(tmp_path / "drive.lcm", [each for each in drive(10.0) if each[1] == "IMU"])
     code, words, _ = run(log, "-c", HUSKY, "--report", tmp_path / "r.html")
     assert code == 0
-    assert "The pose was never valid" in words
+    assert "Never valid in 10.0 s" in words
     assert "No pose in the world" in whole((tmp_path / "r.html").read_text())
+    headline, reason, cause = read_answer(tmp_path / "r.html")
+    assert headline == "Never valid in 10.0 s"
+    assert reason == "Main reason: no usable GPS fix yet (NO_FIX), 100% of the 10.0 s without a valid pose."
+    assert cause.startswith("Probable cause: No messages on channel GPS (sensors.gps). Correct the channel")
 
 
 def test_given_standard_output_then_only_the_page_goes_there(tmp_path: Path, run: Run) -> None:
@@ -167,11 +177,6 @@ def read_figure(drawn: str) -> dict[str, Any]:
     return figure
 
 
-def read_numbers(encoded: dict[str, str]) -> np.ndarray:
-    assert encoded["dtype"] == "f4"
-    return np.frombuffer(base64.b64decode(encoded["bdata"]), "<f4")
-
-
 def test_given_many_points_then_a_curve_keeps_its_peaks_and_little_else() -> None:
     points = np.array([(n / 100.0, 5.0 if n == 3333 else 0.0) for n in range(10_000)])
     drawn = charts.decimate(points, np.floor(points[:, 0])).tolist()
@@ -189,6 +194,31 @@ def test_given_a_curve_with_a_gap_then_the_gap_stays() -> None:
     assert np.isnan(drawn[(x > 40.1) & (x < 59.9)]).all()
     assert np.isfinite(drawn[(x < 39.9) | (x > 60.1)]).all()
     assert drawn[np.isfinite(drawn)] == pytest.approx(np.sin(x[np.isfinite(drawn)]), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(1.0e-5, 1.6e-5), (0.0012, 0.0014), (500000.001, 500000.004), (-0.00586, -0.00584)]
+)
+def test_given_small_changes_of_any_value_then_they_are_drawn_with_digits_for_each_tick(
+    low: float, high: float
+) -> None:
+    t = np.arange(100.0)
+    y = low + (high - low) * (0.5 + 0.5 * np.sin(t))
+    axis = charts.Axis("m", *charts.value_range(y.tolist()))
+    figure = read_figure(
+        charts.render_panels("a", charts.Axis("s", 0.0, 100.0), [charts.Panel("p", axis, [charts.Series("y", t, y)])])
+    )
+    assert read_numbers(figure["data"][0]["y"]) == pytest.approx(y, abs=1e-3 * (high - low))
+    form = figure["layout"]["yaxis"]
+    # no prefix as in 16µ or 500.000001k
+    assert form["exponentformat"] == ("power" if high < 1e-3 and low > -1e-3 else "none")
+    assert form["range"] == pytest.approx((low, high), abs=0.2 * (high - low))
+
+
+def test_given_a_constant_then_its_axis_has_a_range_that_doubles_resolve() -> None:
+    assert charts.value_range([4693737.1] * 3) == pytest.approx((0.9 * 4693737.1, 1.1 * 4693737.1))
+    assert charts.value_range([0.0, 0.0]) == (-0.5, 0.5)
+    assert charts.value_range([2e-10, 4e-10]) == pytest.approx((1.9e-10, 4.1e-10))
 
 
 def test_given_many_dots_then_a_cell_has_one_and_those_beyond_are_at_the_edge() -> None:

@@ -18,8 +18,11 @@ from mstools.report.findings import (
     estimate_fix_latency,
 )
 from mstools.report.replay_data import FixRecord, ReplayData, SourceTimes, StateSample, WheelComparison
+from mstools.report.replay_report import make_answer
+from mstools.report.validity import REMEDIES
 
 START = 1_700_000_000_000_000
+STALE = Invalid.STALE_GPS | Invalid.LIMIT_EXCEEDED
 
 
 def snapshot(t: float, **more: object) -> StateSample:
@@ -156,6 +159,49 @@ def test_given_poses_that_are_never_valid_then_the_reason_is_in_the_finding() ->
     assert [each.title for each in found] == ["The pose was never valid"]
     assert "before the vehicle moves" in found[0].observation
     assert titles(make_data(snapshots=())) == ["There was never a state"]
+
+
+def test_given_nothing_wrong_then_the_answer_is_one_line() -> None:
+    answer, found = make_answer(make_data())
+    assert (answer.tone, answer.headline, answer.lines) == (
+        "good",
+        "Valid 100.0% of 1 min 40 s without interruption; no findings",
+        (),
+    )
+    assert found == []
+
+
+def test_given_interruptions_then_the_answer_has_their_main_reason_and_its_remedy() -> None:
+    # after 10 s of start: 20 s beyond the limit alone, 15 with a stale fix, of which that is the consequence
+    reasons = {Invalid.NO_FIX: (0, 10), Invalid.LIMIT_EXCEEDED: (30, 50), STALE: (60, 75)}
+    given = [
+        snapshot(t, invalid=next((flag for flag, (a, b) in reasons.items() if a <= t < b), VALID)) for t in range(100)
+    ]
+    answer, found = make_answer(make_data(snapshots=tuple(given)))
+    assert (answer.tone, answer.headline) == ("warning", "Valid 55.0% of 1 min 40 s, from 10.0 s on")
+    main, remedy = answer.lines
+    assert "(LIMIT_EXCEEDED), 57% of the 35.0 s not valid after the first valid pose" in main
+    assert remedy == f"Remedy: {REMEDIES[Invalid.LIMIT_EXCEEDED]}."
+    # the answer has it, and what is listed does not repeat it
+    assert found == []
+    assert titles(make_data(snapshots=tuple(given))) == ["The pose was not valid in 39% of the time after it first was"]
+
+
+def test_given_a_log_with_a_gap_then_its_time_is_not_valid_and_the_main_reason() -> None:
+    given = tuple(each for each in map(snapshot, range(100)) if not 40 < each.t < 80)
+    answer, _ = make_answer(make_data(snapshots=given))
+    assert answer.headline == "Valid 61.0% of 1 min 40 s"
+    assert answer.lines[0].startswith("Main reason: no sample, or none that could be used, 100% of the 39.0 s")
+
+
+def test_given_no_state_and_a_missing_channel_then_the_answer_names_it_as_the_cause() -> None:
+    answer, _ = make_answer(make_data(snapshots=(), missing_channels=(("imu", "IMU"),), channels=("GPS",)))
+    assert (answer.tone, answer.headline) == ("error", "Never valid in 1 min 40 s")
+    assert answer.lines[1].startswith("Probable cause: No messages on channel IMU (sensors.imu). Correct the channel")
+
+
+def test_given_the_reasons_then_each_has_a_remedy() -> None:
+    assert set(REMEDIES) == set(Invalid)
 
 
 def test_given_a_vehicle_that_always_backs_up_then_swapped_front_and_rear_are_suspected() -> None:

@@ -69,6 +69,24 @@ class MagnetometerFit:
     samples: int
     outliers: int
 
+    @property
+    def hard_iron_sigma(self) -> float:
+        """Standard deviation of a horizontal component of the hard iron, tesla, for residuals without correlation.
+
+        Each sample's residual changes by -n with the center, n the direction of the field; over a circle the mean of
+        n n' is half the unit matrix.
+        """
+        return self.rms * math.sqrt(2.0 / max(self.samples - self.outliers, 1))
+
+    @property
+    def soft_iron_sigma(self) -> float:
+        """Largest standard deviation of a horizontal element of the soft iron, as `hard_iron_sigma`.
+
+        The residual, relative to the strength, changes by (c^2, 2 c s, s^2) with the elements, for a direction (c, s);
+        over a circle their normal matrix is 1/8 (3 0 1; 0 4 0; 1 0 3), whose inverse has 3, 2 and 3 on its diagonal.
+        """
+        return self.heading_rms * math.sqrt(3.0 / max(self.samples - self.outliers, 1))
+
     def apply(self, fields: npt.ArrayLike) -> Array:
         """Return the corrected fields (n, 3), along the sensor's axes, tesla."""
         away = np.asarray(fields, dtype=float) - np.array(self.hard_iron)

@@ -336,7 +336,6 @@ def replay_offline(
             )
         if collector is not None:
             from mstools.report import replay_report
-            from mstools.report.findings import collect_findings
 
             replayed = collector.finish(
                 log.name, run.first_utime, run.last_utime, run.rejected, channels & seen or seen, run.axis
@@ -344,8 +343,7 @@ def replay_offline(
             with _open_output(report) as out:
                 out.write(replay_report.render_page(replayed))
             if not as_json:
-                findings = replay_report.format_summary(collect_findings(replayed), report)
-                typer.echo("\n".join(findings), err=report == "-")
+                typer.echo("\n".join(replay_report.format_summary(replayed, report)), err=report == "-")
         _report_damage(recording)
 
 

@@ -21,6 +21,7 @@ function makeColors(layout) {
   const changes = {
     paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: readColor("--wash"), "font.color": readColor("--ink"),
     "hoverlabel.bgcolor": readColor("--paper"), "hoverlabel.font.color": readColor("--ink"),
+    "modebar.bgcolor": "rgba(0,0,0,0)", "modebar.color": readColor("--soft"), "modebar.activecolor": readColor("--ink"),
   };
   for (const key of Object.keys(layout).filter((name) => /^[xy]axis/.test(name)))
     for (const part of ["gridcolor", "linecolor", "zerolinecolor"]) changes[`${key}.${part}`] = readColor("--line");

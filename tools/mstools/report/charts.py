@@ -1,9 +1,8 @@
 """Charts that one can touch, and an HTML page for them: one file that opens without internet.
 
 A chart is a figure of plotly.js as JSON; the library's script is in the page, compressed (`page.js` draws the figures,
-links their time axes and shows one time on all of them). Numbers are in single precision. Lines and bands are decimated
-to at most four points in each of `COLUMNS` (first, lowest, highest, last) and dots to one per cell, so that the page
-stays small for a long recording.
+links their time axes and shows one time on all of them). Lines and bands are decimated to at most four points in each
+of `COLUMNS` (first, lowest, highest, last) and dots to one per cell, so that the page stays small for a long recording.
 """
 
 from __future__ import annotations
@@ -111,8 +110,14 @@ def value_range(values: Iterable[float], share: float = 1.0, min_width: float = 
         return (-0.5 * (min_width or 1.0), 0.5 * (min_width or 1.0))
     cut = int(0.5 * (1.0 - share) * len(known))
     low, high = known[cut], known[-1 - cut]
-    middle, half = 0.5 * (low + high), max(0.55 * (high - low), 0.5 * min_width, 1e-9)
+    middle, half = 0.5 * (low + high), max(0.55 * (high - low), 0.5 * min_width)
+    if half <= RESOLUTION * abs(middle):
+        half = 0.1 * abs(middle) or 0.5
     return middle - half, middle + half
+
+
+RESOLUTION = 1e-12
+"""Relative range below which values count as constant: labels of ticks need some digits of double precision's 16."""
 
 
 def level(name: str, x: Axis, y: float, color: str = GRAY) -> Series:
@@ -131,6 +136,7 @@ def dots(name: str, points: Iterable[Sequence[float]], color: str, size: float) 
 def render_panels(label: str, x: Axis, panels: Sequence[Panel], events: Sequence[tuple[float, str]] = ()) -> str:
     """Return panels above one another as HTML; `events` are vertical lines through all of them."""
     figure = make_panels_figure(x, panels, events)
+    _fit_margin(figure["layout"])
     return _render_chart(label, figure, is_over_time=x.label.startswith("seconds"))
 
 
@@ -144,11 +150,14 @@ def render_map(label: str, x: str, y: str, series: Sequence[Series], heights: tu
     traces, layout = _make_panels(axes[0], [Panel("", axes[1], series, height)], ())
     layout["yaxis"] |= {"scaleanchor": "x", "scaleratio": 1}
     layout["hovermode"] = "closest"
+    _fit_margin(layout)
     return _render_chart(label, {"data": traces, "layout": layout})
 
 
 def render_strip(label: str, x: Axis, rows: Sequence[StripRow], events: Sequence[tuple[float, str]] = ()) -> str:
-    return _render_chart(label, make_strip_figure(x, rows, events), is_over_time=True)
+    figure = make_strip_figure(x, rows, events)
+    _fit_margin(figure["layout"])
+    return _render_chart(label, figure, is_over_time=True)
 
 
 # --- figures of plotly.js
@@ -208,6 +217,7 @@ def _make_panels(
         "height": round(inner + HEADER + BELOW),
         "margin": {"l": LEFT, "r": RIGHT, "t": HEADER, "b": BELOW},
         "hovermode": "x unified",
+        "separators": SEPARATORS,
         "annotations": [],
         "shapes": [_make_event_line(when) for when, _ in events],
     }
@@ -233,6 +243,20 @@ def _make_panels(
 
 EVENT_COLOR = "#7a4fb5"
 
+SEPARATORS = ".\u2009"
+"""Of decimals and thousands: a point and a thin space."""
+
+SMALL = 1e-3
+"""Size of an axis's values below which its labels have a power of ten: with more zeros they are hard to read."""
+
+
+def _fit_margin(layout: dict[str, Any]) -> None:
+    """Let the left margin be as wide as the labels of the y axes need: a telephone has no room for more."""
+    layout["margin"]["l"] = 8
+    for name in layout:
+        if name.startswith("yaxis"):
+            layout[name]["automargin"] = "width"
+
 
 def _make_event_line(when: float) -> dict[str, Any]:
     ends = {"x0": when, "x1": when, "y0": 0, "y1": 1, "yref": "paper"}
@@ -246,8 +270,17 @@ def _make_axis(axis: Axis) -> dict[str, Any]:
             "type": "log",
             "range": [math.log10(axis.low), math.log10(axis.high)],
             "exponentformat": "power",
+            "hoverformat": ".4~r",
         }
-    return title | {"range": [axis.low, axis.high], "zeroline": False}
+    # as numbers: with a prefix (16µ, 4.693742M) a label is no value in the axis's unit. Of very small ones a power
+    is_small = max(abs(axis.low), abs(axis.high)) < SMALL
+    # values below the pointer have digits for a thousandth of the axis, at least
+    decimals = 3 - math.floor(math.log10(axis.high - axis.low)) if axis.high > axis.low else 6
+    form = {
+        "exponentformat": "power" if is_small else "none",
+        "hoverformat": ".6~g" if is_small else f".{max(decimals, 0)}~f",
+    }
+    return title | form | {"range": [axis.low, axis.high], "zeroline": False}
 
 
 def _make_traces(series: Series, x: Axis, y: Axis) -> list[dict[str, Any]]:
@@ -287,9 +320,15 @@ def _make_trace(points: Array) -> dict[str, Any]:
 
 
 def _encode(values: Array) -> dict[str, str]:
-    """Return numbers as plotly.js reads them: base64 of single precision, whose nan interrupts a line."""
-    finite = np.where(np.isfinite(values), values, np.nan).astype("<f4")
-    return {"dtype": "f4", "bdata": base64.b64encode(finite.tobytes()).decode()}
+    """Return numbers as plotly.js reads them: in base64, nan interrupts a line.
+
+    In single precision where that rounds by less than 1e-4 of their range, a tenth of a pixel of `WIDTH`.
+    """
+    numbers = np.where(np.isfinite(values), values, np.nan)
+    known = numbers[np.isfinite(numbers)]
+    error = np.abs(known - known.astype("<f4")).max() if len(known) else 0.0
+    kind = "f4" if error <= 1e-4 * (np.ptp(known) if len(known) else 0.0) else "f8"
+    return {"dtype": kind, "bdata": base64.b64encode(numbers.astype(f"<{kind}").tobytes()).decode()}
 
 
 def _to_text(words: str) -> str:
@@ -339,11 +378,22 @@ def _render_chart(label: str, figure: dict[str, Any], is_over_time: bool = False
 # --- page ---------------------------------------------------------------------------------------------------
 
 
-def render_text_page(title: str, lines: Sequence[str], figures: Sequence[str]) -> str:
-    """Return an HTML page with lines of text above charts. Raises as `render_page`."""
-    text = html.escape("\n".join(lines))
-    drawn = "".join(f"<figure>{each}</figure>" for each in figures)
-    return render_page(title, f"<h1>{html.escape(title)}</h1>\n<pre>{text}</pre>\n{drawn}")
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a report has to answer, at its top: how good it is (`good`, or a severity), a headline, and few lines."""
+
+    tone: str
+    headline: str
+    lines: Sequence[str] = ()
+
+
+def render_answer(answer: Answer) -> str:
+    lines = "".join(f"<p>{escape_text(each)}</p>" for each in answer.lines)
+    return f'<div class="answer {answer.tone}"><strong>{escape_text(answer.headline)}</strong>{lines}</div>\n'
+
+
+def render_text(lines: Iterable[str]) -> str:
+    return f"<pre>{html.escape(chr(10).join(lines))}</pre>"
 
 
 def escape_text(text: str) -> str:
@@ -373,17 +423,18 @@ def render_key_figures(figures: Iterable[tuple[str, str]]) -> str:
 
 
 def render_report(
-    title: str, heads: Sequence[str], figures: str, sections: Sequence[tuple[str, str, str]], about: str
+    title: str, heads: Sequence[str], summary: str, sections: Sequence[tuple[str, str, str]], about: str
 ) -> str:
-    """Return a page of sections (name, title, HTML) below key figures, with links to them. Raises as `render_page`.
+    """Return a page of sections (name, title, HTML) below a summary, with links to them. Raises as `render_page`.
 
-    heads: kind of the report, its subject, and lines below, as text; about: what explains it.
+    heads: kind of the report, its subject, and lines below, as text; summary: HTML, the answer and key figures; about:
+    what explains it.
     """
     kicker, subject, *lines = map(escape_text, heads)
     links = " ".join(f'<a href="#{name}">{title}</a>' for name, title, _ in sections)
     body = "\n".join(f'<section id="{name}"><h2>{title}</h2>\n{text}\n</section>' for name, title, text in sections)
     below = "".join(f"<p>{line}</p>\n" for line in lines)
-    top = f'<p class="kicker">{kicker}</p>\n<h1>{subject}</h1>\n{below}{figures}\n<nav>{links}</nav>'
+    top = f'<p class="kicker">{kicker}</p>\n<h1>{subject}</h1>\n{below}{summary}\n<nav>{links}</nav>'
     head = f"<header>\n{top}\n</header>\n"
     foot = f"\n<footer>modelserver {__version__}; {about}</footer>"
     return render_page(escape(title), head + body + foot)

@@ -27,9 +27,10 @@ import numpy as np
 
 from modelserver.errors import Severity
 from modelserver.estimation.filter.eskf import chi_square_gate
-from modelserver.messages import Decision, Invalid, Mode, Verdict
+from modelserver.messages import Decision, Mode, Verdict
 from modelserver.transforms.so3 import Array
 from mstools.report.replay_data import ReplayData, compare_turn_rates
+from mstools.report.validity import NO_SAMPLES, summarize_validity
 from mstools.terminal.output import format_count
 
 MOVING_SPEED = 0.3
@@ -508,29 +509,20 @@ def check_gaps(data: ReplayData) -> Iterable[ReportFinding]:
 
 
 def check_validity(data: ReplayData) -> Iterable[ReportFinding]:
-    """Find poses that were invalid for long after the start, and headings that were never found."""
+    """Find poses that were invalid for long after the start, and those that were never valid."""
+    found = summarize_validity(data)
     if not data.snapshots:
-        reason = "No sample of a configured sensor could be used."
-        advice = "Compare the channels in the log with those in the vehicle file."
-        yield error("There was never a state", reason, advice)
-        return
-    first = next((n for n, each in enumerate(data.snapshots) if not each.invalid), None)
-    if first is None:
-        reason = f"At the end: {data.snapshots[-1].invalid.explain()}."
-        advice = (
-            "Heading alignment takes a few meters of driving with fixes; the strip below shows the reasons over time."
+        yield error(
+            "There was never a state", "No sample of a configured sensor could be used.", _to_sentence(NO_SAMPLES)
         )
-        yield error("The pose was never valid", reason, advice)
-        return
-    after = data.snapshots[first:]
-    bad = [each for each in after if each.invalid]
-    if len(bad) > 0.05 * len(after):
-        reasons = Counter(flag for each in bad for flag in Invalid if flag in each.invalid)
-        words = "; ".join(flag.explain() for flag, _ in reasons.most_common(2))
+    elif math.isnan(found.first_valid):
+        reason = f"At the end: {data.snapshots[-1].invalid.explain()}."
+        yield error("The pose was never valid", reason, _to_sentence(found.reasons[0].remedy))
+    elif found.is_interrupted:
         yield warning(
-            f"The pose was not valid in {len(bad) / len(after):.0%} of the time after it first was",
-            f"Mostly: {words}.",
-            "See the strip of reasons below.",
+            f"The pose was not valid in {found.invalid_after / found.after:.0%} of the time after it first was",
+            f"Mostly: {'; '.join(each.reason for each in found.reasons_after[:2])}.",
+            _to_sentence(found.reasons_after[0].remedy),
         )
 
 

@@ -8,9 +8,11 @@ from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from itertools import cycle, pairwise
 
+from modelserver.errors import Severity
 from modelserver.messages import Decision, Invalid, Mode, Verdict
 from mstools.report import charts
 from mstools.report.charts import (
+    Answer,
     Axis,
     Panel,
     Series,
@@ -23,8 +25,16 @@ from mstools.report.charts import (
     render_table,
     value_range,
 )
-from mstools.report.findings import ReportFinding, collect_findings, compute_consistency, compute_running_nis
+from mstools.report.findings import (
+    ReportFinding,
+    check_validity,
+    collect_findings,
+    compute_consistency,
+    compute_running_nis,
+)
 from mstools.report.replay_data import HOLD_S, ReplayData, StateSample, integrate_distance
+from mstools.report.validity import ValiditySummary, summarize_validity
+from mstools.terminal.health import format_duration
 from mstools.terminal.output import escape, format_count
 
 NIS_WINDOW_S = 20.0
@@ -52,7 +62,7 @@ COMPONENTS: dict[str, tuple[str, ...]] = {
 
 
 def render_page(data: ReplayData) -> str:
-    found = collect_findings(data)
+    answer, found = make_answer(data)
     sections = [
         ("findings", "Findings", _render_findings(found)),
         ("track", "Track", _render_track(data)),
@@ -66,20 +76,67 @@ def render_page(data: ReplayData) -> str:
     began = datetime.fromtimestamp(data.first_utime * 1e-6, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     heads = ("Replay report", data.vehicle, f"{data.log}, start {began}, {data.duration:.0f} s")
     title = f"{data.vehicle}: replay of {data.log}"
-    return charts.render_report(title, heads, _render_key_figures(data), sections, "docs/tuning.md explains each chart")
+    summary = charts.render_answer(answer) + _render_key_figures(data)
+    return charts.render_report(title, heads, summary, sections, "docs/tuning.md explains each chart")
 
 
-def format_summary(found: Sequence[ReportFinding], path: str) -> list[str]:
-    """Return the lines to print: the path of the page, and the headlines of its findings."""
-    lines = [f"report: {escape(path)}, {format_count(len(found), 'finding')}"]
+def format_summary(data: ReplayData, path: str) -> list[str]:
+    """Return the lines to print: the answer, the path of the page, and the headlines of its findings."""
+    answer, found = make_answer(data)
+    lines = [answer.headline, *(f"  {escape(each)}" for each in answer.lines)]
+    lines.append(f"report: {escape(path)}, {format_count(len(found), 'finding')}")
     return lines + [f"  {each.level}: {escape(each.title)}" for each in found]
+
+
+# --- the answer ---------------------------------------------------------------------------------------------
+
+
+def make_answer(data: ReplayData) -> tuple[Answer, list[ReportFinding]]:
+    """Return the share of the time with a valid pose, the main reason of the rest and its remedy; and the findings.
+
+    The first error among the findings is the probable cause of poses that are invalid for long, and its remedy theirs.
+    The findings are without those on validity, which the answer has.
+    """
+    on_validity = list(check_validity(data))
+    found = [each for each in collect_findings(data) if each not in on_validity]
+    cause = next((each for each in found if each.level is Severity.ERROR), None)
+    summary = summarize_validity(data)
+    if math.isnan(summary.first_valid):
+        headline, tone = f"Never valid in {format_duration(summary.duration)}", Severity.ERROR
+    else:
+        headline = f"Valid {summary.share:.1%} of {format_duration(summary.duration)}"
+        headline += f", from {format_duration(summary.first_valid)} on" if summary.first_valid > HOLD_S else ""
+        is_whole = not summary.reasons_after
+        headline += " without interruption" if is_whole else ""
+        tone = min((each.level for each in (*on_validity, *found)), key=list(Severity).index, default=Severity.NOTE)
+        if not found and is_whole:
+            return Answer("good", f"{headline}; no findings"), found
+    reason = _describe_main_reason(summary)
+    lines = [] if reason is None else [reason[0]]
+    if cause is not None:
+        kind = "Probable cause" if on_validity else "Main finding"
+        lines.append(f"{kind}: {cause.title}. {cause.advice}")
+    elif reason is not None:
+        lines.append(f"Remedy: {reason[1]}.")
+    return Answer("good" if tone is Severity.NOTE else str(tone), headline, lines), found
+
+
+def _describe_main_reason(summary: ValiditySummary) -> tuple[str, str] | None:
+    """Return the main reason of the time without a valid pose in a sentence, and its remedy; None without one."""
+    reasons, total, when = summary.reasons, summary.invalid, "without a valid pose"
+    if summary.is_interrupted:
+        reasons, total, when = summary.reasons_after, summary.invalid_after, "not valid after the first valid pose"
+    if not reasons or total <= 0.0:
+        return None
+    share = f"{reasons[0].seconds / total:.0%} of the {format_duration(total)} {when}"
+    return f"Main reason: {reasons[0].reason}, {share}.", reasons[0].remedy
 
 
 # --- parts of the page --------------------------------------------------------------------------------------
 
 
 def _time_axis(data: ReplayData) -> Axis:
-    return Axis("seconds from the log's first event", 0.0, max(data.duration, 1e-3))
+    return Axis("seconds into the log", 0.0, max(data.duration, 1e-3))
 
 
 # --- key figures and findings -------------------------------------------------------------------------------
@@ -91,9 +148,7 @@ def _render_key_figures(data: ReplayData) -> str:
     sigmas = sorted(each.sigma for each in states if math.isfinite(each.sigma))
     verdicts = Counter(each.verdict for each in data.fixes)
     figures = [
-        (f"{data.duration:.0f} s", "recorded"),
         (f"{distance:.0f} m", "driven"),
-        (f"{_valid_share(data):.1%}", "of the recorded time valid"),
         (f"{verdicts['used']} of {len(data.fixes)}", "fixes used as positions"),
         (f"{verdicts['rejected']}", "positions rejected"),
         (f"{sigmas[len(sigmas) // 2]:.2f} m" if sigmas else "none", "median position sigma"),
@@ -101,14 +156,9 @@ def _render_key_figures(data: ReplayData) -> str:
     return render_key_figures(figures)
 
 
-def _valid_share(data: ReplayData) -> float:
-    held = [min(b.t - a.t, HOLD_S) for a, b in pairwise(data.snapshots) if not a.invalid and b.t > a.t]
-    return min(sum(held) / data.duration, 1.0) if data.duration > 0.0 else 0.0
-
-
 def _render_findings(found: Sequence[ReportFinding]) -> str:
     if not found:
-        return '<p class="good">No findings. Compare the charts below with docs/tuning.md.</p>'
+        return "<p>No findings. Compare the charts below with docs/tuning.md.</p>"
     return "\n".join(
         f'<div class="finding {each.level}"><h3><span>{each.level}</span> '
         f"{escape_text(each.title)}</h3><p>{escape_text(each.observation)}</p><p>{escape_text(each.advice)}</p></div>"
@@ -194,7 +244,18 @@ def _render_validity(data: ReplayData) -> str:
     table = render_table(("at, s", "what happened"), listed, numbers=(0,)) if events else "<p>No events.</p>"
     more = f"<p>and {len(events) - 40} more</p>" if len(events) > 40 else ""
     words = "Reasons for which the pose is invalid, each on its row; vertical lines are the events below."
-    return f"{render_figure(chart, words)}\n{table}{more}"
+    return f"{_render_reasons(data)}{render_figure(chart, words)}\n{table}{more}"
+
+
+def _render_reasons(data: ReplayData) -> str:
+    summary = summarize_validity(data)
+    rows = [
+        (each.reason, f"{each.seconds:.1f}", f"{each.seconds / summary.duration:.1%}", each.remedy)
+        for each in summary.reasons
+        if summary.duration
+    ]
+    head = ("reason", "s", "of the log", "remedy")
+    return render_table(head, rows, numbers=(1, 2)) if rows else "<p>The pose was always valid.</p>"
 
 
 def _intervals(
