@@ -75,7 +75,9 @@ def test_given_a_log_then_its_state_at_a_time_is_described(page: Page) -> None:
     assert {each["name"] for each in state["sensors"]} >= {"gps", "imu", "wheels"}
     assert "speed" in state["charts"]
     assert any(each.startswith("state ") for each in state["charts"])
-    assert page.get("/map", width="800", height="400")["vehicle"]["valid"]
+    pose = page.dashboard._source.drive.get_picture(page.dashboard.shown.utime).pose
+    assert pose is not None
+    assert page.get("/state")["place"] == pytest.approx(pose.xyz[:2], abs=0.001)
     assert page.get("/charts", **{"from": "0", "to": "12", "names": ",".join(state["charts"])})["data"]
     assert page.get("/strip", **{"from": "0", "to": "12"})["data"]
     assert page.changes == []

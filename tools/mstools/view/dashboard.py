@@ -20,7 +20,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Final
@@ -162,9 +162,6 @@ class Dashboard:
             drive = self._source.drive
             picture = drive.get_picture(shown.utime)
             view = _read_view(query) if "scale" in query else fit_view(drive, *_read_size(query))
-            if query.get("follow") and picture.pose is not None:
-                east, north, _ = picture.pose.xyz
-                view = replace(view, east=east, north=north)
             found = describe_map(drive, picture, shown.trail_s, view, shown.places)
             origin = drive.origin
         kind = query.get("grid", "")
@@ -258,6 +255,7 @@ def _describe_pose(drive: Drive, picture: Picture) -> dict[str, Any]:
     return {
         "valid": not picture.invalid,
         "reason": picture.invalid.explain() if picture.invalid else "",
+        "place": [round(each, 3) for each in picture.pose.xyz[:2]],
         **{name: value if math.isfinite(value) else None for name, value in values.items()},
     }
 

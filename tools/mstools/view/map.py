@@ -19,7 +19,6 @@ from modelserver.earth import Origin
 from modelserver.earth.geodesy import GeodesyError, geodesy_of
 from modelserver.transforms.so3 import Array, Vector3
 from mstools.recordings.drive import FIX_COLOR, FIX_POSITION, INVALID, MAX_STAMP, Drive, FixColor, Picture
-from mstools.recordings.pose_signals import compute_headings
 
 MAX_FIXES: Final = 3_000
 """Fixes of a view at most, the latest: a page paints them with their ellipses in some 10 ms."""
@@ -72,7 +71,7 @@ def fit_view(drive: Drive, width: int, height: int) -> View:
 def describe_map(
     drive: Drive, picture: Picture, trail_s: float, view: View, places: Mapping[str, Vector3]
 ) -> dict[str, Any]:
-    """Return what a view shows at the time of a picture, as JSON: trail, fixes, vehicle, named `places`, geodesy.
+    """Return what a view shows at the time of a picture, as JSON: trail, fixes, named `places`, geodesy.
 
     fixes: [east, north, `FixColor`, variance east, north, covariance] each, variances None where they are not known.
     trail: lines of one validity each, {"valid": ..., "points": [[east, north], ...]}.
@@ -82,17 +81,8 @@ def describe_map(
         "trail": _list_trail(drive, picture.utime, trail_s, view),
         "fixes": _list_fixes(drive, picture.utime, view),
         "places": {name: _round(place) for name, place in places.items()},
-        "vehicle": None,
         "origin": None,
     }
-    if picture.pose is not None:
-        level = picture.horizontal_protection_level
-        found["vehicle"] = {
-            "at": _round(picture.pose.xyz[:2]),
-            "heading": round(float(compute_headings(np.array([picture.pose.wxyz]))[0]), 2),
-            "valid": not picture.invalid,
-            "level": round(level, 3) if math.isfinite(level) else None,
-        }
     if drive.origin is not None:
         found["origin"] = describe_origin(drive.origin, view)
     return found
@@ -208,9 +198,7 @@ def _list_trail(drive: Drive, utime: int, seconds: float, view: View) -> list[di
     places, flags = np.round(points[shown, :2], 3).tolist(), is_valid[shown]
     breaks = [0, *(np.flatnonzero(np.diff(flags)) + 1).tolist(), len(shown)]
     # a line begins where the last one ends
-    return [
-        {"valid": bool(flags[begin]), "points": places[max(begin - 1, 0) : end]} for begin, end in pairwise(breaks)
-    ]
+    return [{"valid": bool(flags[begin]), "points": places[max(begin - 1, 0) : end]} for begin, end in pairwise(breaks)]
 
 
 def _decimate(points: Array, is_valid: npt.NDArray[np.bool_], view: View) -> npt.NDArray[np.intp]:

@@ -32,6 +32,10 @@ FILE_UTIME: Final = 10**15
 """Stamp of the first joint positions of a geometry file; each later one is a second later."""
 
 
+BATCH_S: Final = 0.01
+"""Pause between batches of messages, seconds: a third of a picture, and what a latency may be too large."""
+
+
 @dataclass
 class Source:
     """A drive and the client that answers queries on it. Read `drive` under `lock`; `close` ends what runs for it.
@@ -189,7 +193,7 @@ def open_live(url: str, prefix: str, timeout: float, packages: Sequence[Path] = 
     source = Source("live", drive, answers, MeshFolders(None, tuple(packages)), is_live=True)
     stop = threading.Event()
     bus = open_lcm(resolve_url(url))
-    arguments = (bus, prefix, drive.feed, stop.is_set, source.lock)
+    arguments = (bus, prefix, drive.feed, stop.is_set, source.lock, BATCH_S)
     listener = threading.Thread(target=follow_bus, args=arguments, name="view", daemon=True)
     listener.start()
 

@@ -26,6 +26,8 @@ function createMap(section, fetchJson) {
   let ground = null;
   let asked = null;
   let isGroundShown = true;
+  // {at, heading, valid, level}, null without a pose
+  let vehicle = null;
 
   const getSize = () => [canvas.clientWidth, canvas.clientHeight];
 
@@ -47,7 +49,6 @@ function createMap(section, fetchJson) {
     const query = new URLSearchParams({ width, height });
     const before = view;
     if (view && !isFitted) for (const [n, name] of ["east", "north", "scale"].entries()) query.set(name, view[n]);
-    if (isFollowing && view) query.set("follow", 1);
     if (grid) query.set("grid", grid);
     try {
       data = await fetchJson(`/map?${query}`);
@@ -106,13 +107,14 @@ function createMap(section, fetchJson) {
     for (const line of data.grid) paintLine(line);
     paintFixes();
     pen.lineWidth = 2;
-    for (const line of data.trail) {
+    for (const [n, line] of data.trail.entries()) {
       pen.strokeStyle = readTone(line.valid ? "--valid" : "--invalid");
-      trace(line.points);
+      // the vehicle is shown more often than the rest
+      trace(vehicle && n === data.trail.length - 1 ? [...line.points, vehicle.at] : line.points);
       pen.stroke();
     }
     for (const [name, place] of Object.entries(data.places)) paintPlace(name, place);
-    if (data.vehicle) paintVehicle(data.vehicle);
+    if (vehicle) paintVehicle();
     paintScale();
     describe();
   }
@@ -178,7 +180,7 @@ function createMap(section, fetchJson) {
     paintText(name, "--place", x + 7, y + 12);
   }
 
-  function paintVehicle(vehicle) {
+  function paintVehicle() {
     const [x, y] = toPixels(vehicle.at);
     const tone = vehicle.valid ? readTone("--vehicle") : readTone("--invalid");
     pen.strokeStyle = pen.fillStyle = tone;
@@ -220,7 +222,7 @@ function createMap(section, fetchJson) {
     canvas.dataset.ground = ground ? ground.view.join() : "";
     section.querySelector("[data-do=ground]").hidden = data.attribution === null;
     section.querySelector(".attribution").textContent = (isGroundShown && data.attribution) || "";
-    if (data.vehicle) canvas.dataset.vehicle = toPixels(data.vehicle.at).join(",");
+    if (vehicle) canvas.dataset.vehicle = toPixels(vehicle.at).join(",");
     canvas.setAttribute("aria-label", `North-up map: ${data.fixes.length} fixes`);
   }
 
@@ -250,6 +252,7 @@ function createMap(section, fetchJson) {
   function setFollow(value) {
     isFollowing = value;
     if (value) isFitted = false;
+    if (value && vehicle && view) view = [...vehicle.at, view[2]];
     section.querySelector("[data-do=follow]").setAttribute("aria-pressed", value);
     refresh();
   }
@@ -313,6 +316,15 @@ function createMap(section, fetchJson) {
     button.addEventListener("click", () => actions[button.dataset.do]());
   new ResizeObserver(() => { paint(); refresh(); }).observe(canvas);
 
+  // of the page's state, which comes more often than what /map has
+  function setVehicle({ place, heading, valid, level }) {
+    vehicle = place ? { at: place, heading: heading ?? 0, valid, level: level ?? null } : null;
+    if (isFollowing && vehicle && view) view = [...vehicle.at, view[2]];
+    if (section.hidden) return;
+    paint();
+    if (view && data) askGround();
+  }
+
   // shows a place: east, north, meters of a pixel
   function show(place) {
     isFitted = false;
@@ -321,5 +333,5 @@ function createMap(section, fetchJson) {
     refresh();
   }
 
-  return { refresh, paint, show, toPixels };
+  return { refresh, paint, setVehicle, show, toPixels };
 }

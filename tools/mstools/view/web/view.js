@@ -350,6 +350,8 @@ let isPolling = false;
 let lastState = "";
 let lastMap = 0;
 
+const isMoving = () => state?.is_playing || state?.follows;
+
 async function poll() {
   if (isPolling) return;
   isPolling = true;
@@ -364,7 +366,9 @@ async function poll() {
     if (state.has_time) {
       showTimeBar();
       showChoice();
-      if (text !== lastState || Date.now() - lastMap > IDLE_MS) {
+      map.setVehicle(state);
+      // while time goes on the vehicle moves, and the rest comes more rarely
+      if ((text !== lastState && !isMoving()) || Date.now() - lastMap > IDLE_MS) {
         lastMap = Date.now();
         map.refresh();
       }
@@ -383,8 +387,7 @@ async function poll() {
     console.info(`no answer: ${error}`);
   }
   isPolling = false;
-  const isMoving = state?.is_playing || state?.follows;
-  timer = setTimeout(poll, isGone || !isMoving || document.hidden ? IDLE_MS : POLL_MS);
+  timer = setTimeout(poll, isGone || !isMoving() || document.hidden ? IDLE_MS : POLL_MS);
 }
 
 // --- begin
