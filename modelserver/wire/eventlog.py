@@ -11,6 +11,7 @@ import mmap
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple, Self, TypeAlias
 
@@ -86,6 +87,11 @@ def scan(data: Buffer, start: int = 0) -> Iterator[LogEvent | LogDamage]:
         yield LogDamage(bad, size - bad, good, tail=True)
 
 
+@lru_cache(maxsize=1024)
+def _decode_channel(name: bytes) -> str:
+    return name.decode("ascii")
+
+
 def _event_at(data: Buffer, at: int, size: int) -> LogEvent | None:
     """Return the event that starts at an offset, None where there is no complete one."""
     if size - at < _HEAD.size:
@@ -100,10 +106,11 @@ def _event_at(data: Buffer, at: int, size: int) -> LogEvent | None:
     if end > size:
         return None
     # the next event may be cut within its first word
-    if end < size and not _SYNC.startswith(data[end : end + 4]) and data.find(_SYNC, at + 4, end) >= 0:
+    following = data[end : end + 4]
+    if following != _SYNC and not _SYNC.startswith(following) and data.find(_SYNC, at + 4, end) >= 0:
         return None  # the length is corrupt: the event would contain the ones that follow
     try:
-        channel = data[start : start + channel_length].decode("ascii")
+        channel = _decode_channel(data[start : start + channel_length])
     except UnicodeDecodeError:
         return None
     return LogEvent(number, utime, channel, data[start + channel_length : end], end)

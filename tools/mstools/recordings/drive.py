@@ -273,13 +273,13 @@ class Drive:
         self._epoch = -1
         self._gps = fingerprint_of("gps_t")
         self._handlers = {
-            "POSE": self._process_pose,
-            "MODEL_SNAPSHOT": self._process_snapshot,
-            "JOINTS_HELD": self._process_joints,
-            "LOCALIZATION_DECISIONS": self._process_decisions,
-            "LOCALIZATION_STATE": self._store_report,
-            "MODELSERVER_HEALTH": self._store_report,
-            "DRIVER_HEALTH": self._process_driver,
+            f"{self.prefix}POSE": self._process_pose,
+            f"{self.prefix}MODEL_SNAPSHOT": self._process_snapshot,
+            f"{self.prefix}JOINTS_HELD": self._process_joints,
+            f"{self.prefix}LOCALIZATION_DECISIONS": self._process_decisions,
+            f"{self.prefix}LOCALIZATION_STATE": self._store_report,
+            f"{self.prefix}MODELSERVER_HEALTH": self._store_report,
+            f"{self.prefix}DRIVER_HEALTH": self._process_driver,
         }
 
     # --- messages
@@ -291,20 +291,21 @@ class Drive:
             if len(self.channels) >= MAX_CHANNELS or not channel.startswith(self.prefix):
                 return
             counted = self.channels[channel] = ChannelCount()
-        name, stamp = channel[len(self.prefix) :], read_stamp(data)
-        counted.add(now, stamp if 0 < stamp < MAX_STAMP else 0)
+        stamp = read_stamp(data)
+        handler = self._handlers.get(channel)
         if not 0 < stamp < MAX_STAMP:
             # every message of this project begins with its stamp; what does not is of no use here
-            self.damaged += name in self._handlers
+            counted.add(now)
+            self.damaged += handler is not None
             return
+        counted.add(now, stamp)
         try:
-            handler = self._handlers.get(name)
             if handler is not None:
-                handler(name, stamp, data)
+                handler(channel[len(self.prefix) :], stamp, data)
             elif data[:8] == self._gps:
                 self._process_gps(decode("gps_t", data))
             elif channel == self.joints_channel:
-                self._process_joints(name, stamp, data)
+                self._process_joints(channel[len(self.prefix) :], stamp, data)
         except (WireError, GeodesyError, struct.error):
             self.damaged += 1
 

@@ -182,25 +182,28 @@ def scan_log(log: Iterable[LogEvent], prefix: str, with_geometry: bool = True) -
     """Return the contents of a log; `with_geometry` includes the snapshot."""
     offsets: list[tuple[int, int]] = []
     first: PoseAnswer | None = None
-    spans: dict[str, tuple[int, int]] = {}
+    spans: dict[str, list[int]] = {}
     parts = ""
     snapshot: ModelSnapshot | None = None
     assembler, received = SnapshotAssembler(), set[tuple[str, int]]()
+    poses, snapshots = f"{prefix}POSE", f"{prefix}MODEL_SNAPSHOT"
 
-    def extend(what: str, stamp: int) -> None:
-        low, high = spans.get(what, (stamp, stamp))
-        spans[what] = (min(low, stamp), max(high, stamp))
-
+    # written out: an hour of log has two million events
     for event in log:
-        extend("", event.utime)
+        for what, stamp in (("", event.utime), (event.channel, read_stamp(event.data))):
+            span = spans.get(what)
+            if span is None:
+                spans[what] = [stamp, stamp]
+            elif stamp > span[1]:
+                span[1] = stamp
+            elif stamp < span[0]:
+                span[0] = stamp
         try:
-            if event.channel == f"{prefix}POSE":
+            if event.channel == poses:
                 first = first or decode("pose_transform_t", event.data)
-                stamp = read_stamp(event.data)
-                extend(event.channel, stamp)
                 if not offsets or stamp - offsets[-1][0] >= OFFSET_PERIOD_US:
                     offsets.append((stamp, event.end))
-            elif event.channel == f"{prefix}MODEL_SNAPSHOT":
+            elif event.channel == snapshots:
                 if not with_geometry or snapshot is not None:
                     continue
                 part: SnapshotPart = decode("model_snapshot_t", event.data)
@@ -209,12 +212,10 @@ def scan_log(log: Iterable[LogEvent], prefix: str, with_geometry: bool = True) -
                 parts = f"only {count} of {part.parts} parts of revision {part.model_revision}"
                 whole = assembler.add(part)
                 snapshot = None if whole is None else decode_snapshot(whole)
-            else:
-                extend(event.channel, read_stamp(event.data))
         except WireError:
             continue
     joints = f"{prefix}JOINTS" if snapshot is None else snapshot.joints_channel
-    begin, end = spans.get(f"{prefix}POSE") or spans.get(joints) or spans.get("") or (0, 0)
+    begin, end = spans.get(poses) or spans.get(joints) or spans.get("") or (0, 0)
     base_frame = revision = ""
     if first is not None:
         base_frame, revision = first.transformation.frame_of_interest, first.transformation.model_revision

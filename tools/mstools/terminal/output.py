@@ -9,13 +9,12 @@ import os
 import signal
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from enum import IntEnum
 from pathlib import Path
 from threading import Event
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, Final, TextIO
 
 import typer
 
@@ -314,9 +313,13 @@ def show_progress(label: str, total: float) -> Iterator[Callable[..., None]]:
         yield lambda done, text=label: bar.update(task, completed=done, description=text)
 
 
+PROGRESS_STEPS: Final = 200
+"""Of a bar while a log is read: half a character of a terminal."""
+
+
 @contextmanager
 def read_with_progress(label: str, path: Path) -> Iterator[tuple[LogFile, Generator[LogEvent, None, None]]]:
-    """Open a log; give it with its events, and show how much of them is read, at most ten times a second.
+    """Open a log; give it with its events, and show how much of them is read.
 
     The progress bar, which redirects standard output, lasts from the first event until they are read, or closed.
     """
@@ -324,10 +327,10 @@ def read_with_progress(label: str, path: Path) -> Iterator[tuple[LogFile, Genera
 
     def track() -> Generator[LogEvent, None, None]:
         with show_progress(f"{label} {path.name}", log.size) as show:
-            updated = 0.0
+            shown = 0
             for event in log:
-                if (now := time.monotonic()) > updated + 0.1:
-                    updated = now
+                if event.end >= shown:
+                    shown = event.end + log.size // PROGRESS_STEPS
                     show(event.end)
                 yield event
 

@@ -182,6 +182,7 @@ class VehicleScene:
         self._place = self._scene.add_frame("/world/place", show_axes=False, visible=False)
         self._level = self._scene.add_frame("/world/place/protection_level", show_axes=False, visible=False)
         self._circle = self._add_lines("/world/place/protection_level/position", VALID_COLOR, 2.0)
+        self._uncertainty_color = VALID_COLOR
         angles = np.linspace(0.0, 2.0 * math.pi, 65)
         self._draw_line(self._circle, np.stack([np.cos(angles), np.sin(angles), np.zeros(65)], axis=1))
         self._wedge = [
@@ -433,8 +434,10 @@ class VehicleScene:
     def _place_bodies(self, poses: Mapping[str, Pose]) -> None:
         """Move bodies to their poses in the base frame, and redraw what depends on them."""
         for name, pose in poses.items():
-            node = self._bodies[name]
-            node.position, node.wxyz = pose.xyz, pose.wxyz
+            node, before = self._bodies[name], self._poses.get(name)
+            node.wxyz = pose.wxyz
+            if before is None or before.xyz != pose.xyz:
+                node.position = pose.xyz
         self._poses.update(poses)
         for ends, lines in zip(self._ends, self._edges, strict=True):
             if not ends or any(body in poses for pair in ends for body, _ in pair):
@@ -566,12 +569,14 @@ class VehicleScene:
         self._ellipsoid.visible = picture.covariance is not None
         if picture.covariance is not None:
             self._ellipsoid.scale, axes = compute_ellipsoid(picture.covariance, CHI_SQUARE_3[confidence])
-            self._ellipsoid.wxyz, self._ellipsoid.color = axes.wxyz, color
+            self._ellipsoid.wxyz = axes.wxyz
+        if color != self._uncertainty_color:
+            self._uncertainty_color = self._ellipsoid.color = color
+            for lines in (self._circle, *self._wedge):
+                lines.colors = np.array(color, np.uint8)
         self._level.visible = math.isfinite(radius)
         if self._level.visible:
             self._circle.scale = round(radius, 2)
-            for lines in (self._circle, *self._wedge):
-                lines.colors = np.array(color, np.uint8)
             for sign, side in zip((-1.0, 1.0), self._wedge, strict=True):
                 side.visible, side.scale = math.isfinite(heading), round(max(radius, MIN_WEDGE), 2)
                 if side.visible:

@@ -53,7 +53,7 @@ TRAILS: Final = {"10 s": 10.0, "60 s": 60.0, "10 min": 600.0, "all": math.inf}
 RATE_PERIOD_US: Final = 3_000_000
 """Rates of sensors are means over this time: a report alone may be of a tenth of a second."""
 
-PICTURE_S: Final = 1.0 / 30.0
+PICTURE_S: Final = 1.0 / 25.0
 """Period of pictures, seconds."""
 
 SLIDER_PERIOD_S: Final = 0.2
@@ -68,7 +68,7 @@ HOVER_DISTANCE: Final = 0.03
 LABEL_PERIOD_S: Final = 0.2
 """Period at which it is decided which names are shown, seconds."""
 
-UNCERTAINTY_PERIOD_S: Final = 0.1
+UNCERTAINTY_PERIOD_S: Final = 0.2
 """Period at which the shape of the uncertainty follows, seconds; its place does with each picture."""
 
 FIX_PERIOD_S: Final = 0.5

@@ -193,7 +193,11 @@ function searchTree() {
 
 // --- panes
 
-const panes = recall("panes", { scene: true, map: false, plots: true });
+// a link can choose: /#map,plots
+const linked = location.hash.slice(1).split(",").filter((each) => find(each));
+const panes = linked.length
+  ? Object.fromEntries(linked.map((each) => [each, true]))
+  : recall("panes", { scene: true, map: false, plots: true });
 
 function showPanes() {
   const hasTime = state === null || state.has_time;
