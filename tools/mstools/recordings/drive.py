@@ -17,6 +17,7 @@ from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass, field
 from enum import IntEnum, StrEnum
+from functools import lru_cache
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -563,15 +564,19 @@ class Drive:
         for stamp, data in stored[bisect_right(stored, end - round(seconds * 1e6), key=itemgetter(0)) :]:
             if stamp > end:
                 break
-            try:
-                navigation = decode("navigation_state_t", data)
-                at, count = navigation.names.index(state), len(navigation.names)
-            except (WireError, ValueError):
-                continue
-            variance = navigation.covariance[at * (count + 1)]
-            rows.append(((stamp - end) * 1e-6, navigation.values[at], math.sqrt(max(variance, 0.0))))
+            with suppress(WireError, KeyError):
+                rows.append(((stamp - end) * 1e-6, *_read_states(data)[state]))
         times, values, sigmas = np.array(rows, float).reshape(-1, 3).T
         return times, values, sigmas
+
+
+@lru_cache(maxsize=MAX_ROWS // 30)
+def _read_states(data: bytes) -> dict[str, tuple[float, float]]:
+    """Return value and standard deviation of each state of the filter. A chart asks for all of them again and again."""
+    navigation = decode("navigation_state_t", data)
+    variances = navigation.covariance[:: len(navigation.names) + 1]
+    sigmas = (math.sqrt(max(each, 0.0)) for each in variances)
+    return dict(zip(navigation.names, zip(navigation.values, sigmas, strict=True), strict=True))
 
 
 def compute_nis(decision: Decision) -> tuple[str, float] | None:
