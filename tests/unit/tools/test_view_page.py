@@ -167,3 +167,13 @@ def test_given_a_client_that_asks_for_a_public_tunnel_then_there_is_none(page: P
         handler(0, ShareUrlRequest())
     page.server._thread_executor.shutdown(wait=True)
     assert page.server._share_tunnel is None
+
+
+def test_given_a_connection_that_is_closed_unused_then_nothing_is_printed(
+    page: Page, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.create_connection(("127.0.0.1", urlsplit(page.link).port or 0), timeout=10.0):
+        pass
+    assert fetch(page, "/scene").status == 200
+    found = capsys.readouterr()
+    assert (found.out, found.err) == ("", "")

@@ -38,6 +38,7 @@ from mstools.recordings.pose_signals import CHI_SQUARE_3, compute_ellipsoid
 from mstools.view.camera import VIEWS, fit_camera, project
 from mstools.view.page import Page, escape_markdown, open_page
 from mstools.view.scene import (
+    AXES_PX,
     LABEL_PX,
     MARK_SCALE,
     OUTLINE_SCALE,
@@ -374,6 +375,33 @@ def test_given_a_camera_then_no_name_covers_another_and_the_chosen_ones_are_show
     # what is looked at is in the middle of the picture, and what is behind has no place in it
     assert project(np.array([look_at]), camera)[0][0] == pytest.approx((600.0, 400.0))
     assert np.isnan(project(np.array([2 * position - look_at]), camera)[0]).all()
+
+
+def test_given_a_camera_that_comes_nearer_then_axes_have_the_same_length_in_its_picture(page: Page) -> None:
+    scene = make_scene(page, open_geometry(find_vehicle_file(), {}))
+    axes = scene._axes["Raptor"]
+    for distance in (3.0, 4.5, 6.0):
+        camera = SimpleNamespace(
+            position=np.array((-distance, 0.0, 2.0)),
+            look_at=np.array((0.0, 0.0, 0.5)),
+            up_direction=np.array((0.0, 0.0, 1.0)),
+            fov=0.9,
+            image_width=1200,
+            image_height=800,
+        )
+        scene.scale_axes(camera, 1.5)
+        starts, length = axes.batched_positions, axes.batched_scales.reshape(-1, 1)
+        pixels, depths = project(scene._to_scene(scene._poses["Raptor"].transform(starts)), camera)
+        right = np.cross(
+            (camera.look_at - camera.position) / np.linalg.norm(camera.look_at - camera.position), (0, 0, 1)
+        )
+        ends = scene._to_scene(scene._poses["Raptor"].transform(starts)) + length * right / np.linalg.norm(right)
+        shown = np.linalg.norm(project(ends, camera)[0] - pixels, axis=1)
+        assert shown[depths > 0.5] == pytest.approx(1.5 * AXES_PX, rel=0.06)
+    # far away they shrink with the vehicle
+    camera.position = np.array((-500.0, 0.0, 2.0))
+    scene.scale_axes(camera, 2.0)
+    assert axes.batched_scales == pytest.approx(0.2 * scene.size)
 
 
 def test_given_a_covariance_then_its_ellipsoid_holds_the_stated_share_of_its_errors() -> None:

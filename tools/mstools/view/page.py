@@ -21,6 +21,7 @@ import asyncio
 import hmac
 import http
 import ipaddress
+import logging
 import queue
 import re
 import secrets
@@ -254,6 +255,8 @@ def open_page(address: str = "127.0.0.1", port: int = 8080, *, with_token: bool 
     def respond(path: str, query: Mapping[str, str]) -> Reply | None:
         return pages[0].respond(path, query) if pages else None
 
+    # browsers open connections ahead of need and close them unused: websockets reports each with a traceback
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     # its own messages on stdout are replaced by the link
     serve = partial(_serve, guard, bound, respond)
     with redirect_stdout(StringIO()), patch.object(websockets.asyncio.server, "serve", serve):

@@ -59,6 +59,18 @@ FIX_COLORS: Final = np.array([VALID_COLOR, INVALID_COLOR, (240, 190, 60), FIXED_
 LABEL_PX: Final = (6.0, 16.0)
 """Width of a label's character and height of a label in pixels, as viser draws them (measured on a screenshot)."""
 
+AXES_PX: Final = 24.0
+"""Length of axes in pixels: one and a half labels high."""
+
+AXES_SCALE: Final = 0.05
+AXES_SCALES: Final = (0.005, 0.2)
+"""Length of axes before there is a camera, and the least and largest one, as parts of the size of the model.
+
+Far away they would cover the vehicle; a camera within a frame would have none."""
+
+AXES_TOLERANCE: Final = 0.05
+"""Relative change of the length that is sent: one pixel."""
+
 GRID_LABELS: Final = 1
 """Labeled grid crossings on each side of the vehicle, at `LABEL_SPACING`."""
 
@@ -142,6 +154,7 @@ class VehicleScene:
         self._bodies: dict[str, viser.SceneNodeHandle] = {}
         self._frames: FramePoses | None = None
         self._poses: dict[str, Pose] = {}
+        self._axes: dict[str, Any] = {}
         self._labels: list[NodeLabel] = []
         self._path: tuple[str, ...] = ()
         self._ends: list[list[list[tuple[str, Vector3]]]] = [[], []]
@@ -236,6 +249,7 @@ class VehicleScene:
         # went with its body
         self._gizmo = self._mark = None
         self._bodies, self._poses, self._labels, self._points, self._solid, self.unread = {}, {}, [], {}, {}, {}
+        self._axes = {}
         self._groups |= {"shapes": [], "axes": []}
         self._frames = FramePoses(model, base_frame)
         # the largest extent of a body's frames
@@ -316,9 +330,11 @@ class VehicleScene:
             f"{root}/axes",
             np.array([each.pose.wxyz for each in body.frames], np.float32),
             np.array([each.pose.xyz for each in body.frames], np.float32),
-            axes_length=0.05 * size,
-            axes_radius=0.0015 * size,
+            np.full(len(body.frames), AXES_SCALE * size, np.float32),
+            axes_length=1.0,
+            axes_radius=0.03,
         )
+        self._axes[body.name] = axes
         self._groups["axes"].append(axes)
         self._add_pick(axes, lambda event: body.frames[event.instance_index or 0].full_name)
         for number, frame in enumerate(body.frames):
@@ -370,6 +386,17 @@ class VehicleScene:
             return scene.add_icosphere(name, shape.size[0], **look)
         x, y, z = shape.size
         return scene.add_glb(name, mesh.glb, scale=(x, y, z), **place)
+
+    def scale_axes(self, camera: Any, density: float) -> None:
+        """Draw the axes of frames with a constant length in the picture of a camera; `density` as in `show_labels`."""
+        focal = 0.5 * camera.image_height / math.tan(0.5 * camera.fov)
+        for name, axes in self._axes.items():
+            places = self._poses.get(name, Pose.identity()).transform(axes.batched_positions)
+            _, depths = project(self._to_scene(places), camera)
+            least, most = (each * self._size for each in AXES_SCALES)
+            scales = np.clip(AXES_PX * density * depths / focal, least, most)
+            if np.any(np.abs(scales / axes.batched_scales - 1.0) > AXES_TOLERANCE):
+                axes.batched_scales = scales.astype(np.float32)
 
     def show_labels(self, shown: NameLabels, chosen: Collection[str], camera: Any = None, density: float = 1.0) -> None:
         """Show the names of bodies or frames, and those of some frames in any case.

@@ -207,6 +207,8 @@ class Viewer:
                 latest = self._camera.find_latest()
                 density = 1.0 if latest is None else self._server.get_density(latest.client)
                 self._scene.show_labels(*named, latest, density)
+                if latest is not None:
+                    self._scene.scale_axes(latest, density)
             center, is_following = self._scene.center, display.follow.value
             self._scene.show(picture, is_following)
             if self._balance is not None:
