@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from pathlib import Path
 import trimesh
 from PIL import Image
 from playwright.sync_api import FrameLocator, Page
-from support_browser import CHROMIUM, open_link, select_item, show, start_browser
+from support_browser import CHROMIUM, find_fields, open_link, select_item, show, start_browser
 from support_lcm import reserved_url
 from support_recordings import HUSKY, REPOSITORY
 from support_view import follow_drive, record_drive
@@ -40,10 +41,12 @@ def main() -> int:
     take_charts("drive.png")
     take("view-geometry.png", open_geometry(find_vehicle_file(), {}))
     take_editor("view-edit.png")
+    take_dynamics("view-dynamics.png")
     with tempfile.TemporaryDirectory() as folder:
         log = record_drive(Path(folder), DRIVE_S)
         take_page("view-log.png", open_log(log), at=0.75 * DRIVE_S)
         take_state("view-state.png", open_log(log))
+        take_report("report.png", Path(folder), log)
         take("view-robot.png", open_geometry(make_robot(Path(folder)), {}))
     if (bag := SHARED / "husky" / "test1.bag").exists():
         with open_lcm_log(bag) as log, open_localized(log, HUSKY) as localized:
@@ -189,6 +192,32 @@ def take_editor(name: str) -> None:
         page.get_by_role("tab", name="Edit").click()
         select_item(page, "constraint", "FrontNoddingSICKFixed")
         page.wait_for_timeout(3e3)
+        write_picture(page.screenshot(), IMAGES / name)
+    print(IMAGES / name)
+
+
+def take_dynamics(name: str) -> None:
+    """Write the screenshot of center of mass and loads on tilted ground."""
+    with start_browser() as browser, show(browser, open_geometry(find_vehicle_file(), {}), sharpness=1.0) as page:
+        close_warning(page)
+        page.get_by_role("tab", name="Joints").click()
+        page.get_by_text("Dynamics", exact=True).click()
+        page.get_by_label("Center of mass").check()
+        tilt = find_fields(page, "Tilt: roll (deg)").and_(page.locator("[inputmode]"))
+        tilt.fill("10")
+        tilt.press("Enter")
+        page.wait_for_timeout(4e3)
+        write_picture(page.screenshot(), IMAGES / name)
+    print(IMAGES / name)
+
+
+def take_report(name: str, folder: Path, log: Path) -> None:
+    """Write the screenshot of the begin of a replay report."""
+    arguments = ["replay", str(log), "-c", str(find_vehicle_file()), "--report", str(folder / "report.html")]
+    run = "from mstools.cli import main; main()"
+    subprocess.run([sys.executable, "-c", run, *arguments], check=True, stdout=subprocess.DEVNULL)
+    with start_browser() as browser, open_link(browser, (folder / "report.html").as_uri()) as page:
+        page.locator("html[data-drawn]").wait_for()
         write_picture(page.screenshot(), IMAGES / name)
     print(IMAGES / name)
 

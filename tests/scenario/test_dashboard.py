@@ -18,7 +18,7 @@ pytest.importorskip("viser", reason="the extra view is not installed: pip instal
 from modelserver.earth.geodesy import geodesy_of
 from mstools.commands.demo import find_vehicle_file
 from mstools.recordings.drive import QUATERNION, Drive
-from mstools.recordings.pose_signals import compute_headings, compute_speeds
+from mstools.recordings.pose_signals import compute_headings, compute_signals
 from mstools.view.page import open_page
 from mstools.view.sources import open_geometry, open_log
 from mstools.view.viewer import Viewer
@@ -58,7 +58,9 @@ def test_given_a_time_of_a_log_then_the_strip_has_validity_motion_and_ages(shown
     assert page.get_by_role("status").inner_text().strip() == "VALID"
     table = drive.poses
     row = table.find(drive.begin + round(AT * 1e6))
-    assert read_figure(page, "speed") == pytest.approx(compute_speeds(table.utimes, table.rows)[row], abs=0.02)
+    assert read_figure(page, "speed") == pytest.approx(
+        compute_signals(drive, drive.begin + round(AT * 1e6)).speed, abs=0.02
+    )
     assert read_figure(page, "heading") == pytest.approx(compute_headings(table.rows[:, QUATERNION])[row], abs=1.0)
     assert page.get_by_label("Age of each sensor").get_by_role("listitem").count() == 4
     page.evaluate("seek(1)")
@@ -139,8 +141,7 @@ def test_given_the_plots_then_they_have_the_drive_and_a_click_shows_that_time(sh
         " return [[...x], [...y]]; })()"
     )
     at = min(range(len(x)), key=lambda n: abs(x[n] - AT))
-    row = drive.poses.find(drive.begin + round(x[at] * 1e6) + 500)
-    assert y[at] == pytest.approx(compute_speeds(drive.poses.utimes, drive.poses.rows)[row], abs=0.01)
+    assert y[at] == pytest.approx(compute_signals(drive, drive.begin + round(x[at] * 1e6) + 500).speed, abs=0.01)
     chart = page.locator("#charts")
     left, width = page.evaluate(
         "(() => { const chart = document.getElementById('charts');"

@@ -197,10 +197,12 @@ def test_given_a_log_then_the_signals_to_plot_are_those_of_the_viewer(log: Path,
     assert states[-1]["reason"] == ""
     times = [each["timestamp"]["sec"] * 1_000_000 + each["timestamp"]["nsec"] // 1000 for each in states]
     assert times == drive.poses.utimes.tolist()
-    # of the positions 0.2 s before
-    last = int(np.searchsorted(drive.poses.utimes, times[-1] - 200_000))
-    way = float(np.linalg.norm(rows[-1, :2] - rows[last, :2]))
-    assert states[-1]["speed"] == pytest.approx(way / (times[-1] - times[last]) * 1e6)
+    # of odometry, 0.2 s before
+    utimes, places = drive.odometry.utimes, drive.odometry.rows[:, :2]
+    last = drive.odometry.find(times[-1])
+    first = int(np.searchsorted(utimes, utimes[last] - 200_000))
+    way = float(np.linalg.norm(places[last] - places[first]))
+    assert states[-1]["speed"] == pytest.approx(way / (utimes[last] - utimes[first]) * 1e6)
     assert states[-1]["speed"] > 0.5
 
 

@@ -17,9 +17,9 @@ from mstools.report.findings import (
     compute_running_nis,
     estimate_fix_latency,
 )
-from mstools.report.replay_data import FixRecord, ReplayData, SourceTimes, StateSample, WheelComparison
+from mstools.report.replay_data import HOLD_S, FixRecord, ReplayData, SourceTimes, StateSample, WheelComparison
 from mstools.report.replay_report import make_answer
-from mstools.report.validity import REMEDIES
+from mstools.report.validity import REMEDIES, _find_holds
 
 START = 1_700_000_000_000_000
 STALE = Invalid.STALE_GPS | Invalid.LIMIT_EXCEEDED
@@ -256,3 +256,19 @@ def test_given_what_was_set_aside_then_it_does_not_count() -> None:
     aside = decisions("a", 9.0, 1)[0]._replace(verdict=Verdict.MONITORED)
     rejected = Decision(START, "gps", 0, "a", Verdict.REJECTED, "satellites")
     assert compute_consistency([aside, rejected]) == []
+
+
+@pytest.mark.parametrize(
+    ("times", "held"),
+    [
+        ((0.0, 0.2, 0.19, 0.4, 1.0), (0.2, 0.0, 0.2, 0.6)),
+        # a gap is no state
+        ((0.0, 60.0, 60.5), (HOLD_S, 0.5)),
+        # the clock is set back by 10 s
+        ((20.0, 20.5, 10.5, 11.0), (0.5, 0.0, 0.5)),
+    ],
+)
+def test_given_states_in_the_order_of_arrival_then_no_time_counts_twice(
+    times: tuple[float, ...], held: tuple[float, ...]
+) -> None:
+    assert _find_holds(times) == pytest.approx(held)

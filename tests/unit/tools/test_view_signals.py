@@ -13,7 +13,7 @@ pytest.importorskip("plotly", reason="the extra view is not installed: pip insta
 
 from modelserver.messages import Invalid
 from mstools.recordings.drive import QUATERNION, Drive
-from mstools.recordings.pose_signals import compute_headings, compute_speeds
+from mstools.recordings.pose_signals import compute_headings, compute_signals, compute_speeds
 from mstools.report.charts import COLUMNS
 from mstools.view.signals import CHARTS, Span, make_panels, make_strip
 
@@ -62,6 +62,16 @@ def test_given_a_reset_or_a_gap_then_no_speed_is_computed_across_it() -> None:
     speeds = compute_speeds(drive.poses.utimes, drive.poses.rows)
     assert np.nanmax(speeds) < 2 * SPEED
     assert math.isnan(speeds[-1])
+
+
+def test_given_odometry_then_a_correction_of_the_pose_is_no_speed() -> None:
+    drive = make_drive(10.0)
+    drive.odometry = make_drive(10.0).poses
+    drive.poses.rows[150:, 0] += 0.8
+    assert drive.motion is drive.odometry
+    chart = read(make_panels(drive, get_span(drive, 0.0, 10.0), ["speed"])["data"][0]["y"])
+    assert np.nanmax(chart) == pytest.approx(SPEED, rel=0.01)
+    assert compute_signals(drive, int(drive.poses.utimes[150])).speed == pytest.approx(SPEED, rel=0.01)
 
 
 def test_given_an_hour_then_a_chart_has_its_extremes_and_a_zoom_all_of_its_points() -> None:

@@ -304,7 +304,7 @@ class FoxgloveWriter:
         picture = drive.get_picture(drive.poses.last)
         entity = make_uncertainty(picture, WORLD)
         self._uncertainty.log(SceneUpdate(entities=[entity]), log_time=now * 1000)
-        signals = compute_signals(drive.poses, picture.utime)
+        signals = compute_signals(drive, picture.utime)
         values = {
             "speed": signals.speed,
             "heading_deg": signals.heading,

@@ -233,6 +233,9 @@ _POSE_COLUMNS: Final = 17
 _UPPER: Final = np.triu_indices(3)
 FIX_POSITION, FIX_COLOR, FIX_COLUMNS = slice(3, 6), 6, 10
 
+ODOMETRY_PERIOD_US: Final = 100_000
+"""Least time between two stored poses of odometry, microseconds: a quarter of the time that a speed is of."""
+
 MAX_INTERPOLATION_US: Final = 1_000_000
 """Longest time between two poses that is interpolated."""
 
@@ -252,6 +255,7 @@ class Drive:
     keep_geometry: bool = False
     origin: Origin | None = None
     poses: Table = field(default_factory=lambda: Table(_POSE_COLUMNS))
+    odometry: Table = field(default_factory=lambda: Table(_POSE_COLUMNS))
     joints: dict[str, Table] = field(default_factory=dict)
     events: list[DriveEvent] = field(default_factory=list)
     channels: dict[str, ChannelCount] = field(default_factory=dict)
@@ -267,7 +271,7 @@ class Drive:
         self._geometries: list[tuple[int, Model, str]] = []
         self.joints_channel = f"{self.prefix}JOINTS"
         self._sources: dict[str, int] = {}
-        self._last_pose = 0
+        self._last_pose = self._last_odometry = 0
         self._reports: dict[str, list[tuple[int, bytes]]] = {}
         self._invalid: Invalid | None = None
         self._mode: Mode | None = None
@@ -275,6 +279,7 @@ class Drive:
         self._gps = fingerprint_of("gps_t")
         self._handlers = {
             f"{self.prefix}POSE": self._process_pose,
+            f"{self.prefix}POSE_ODOM": self._process_odometry,
             f"{self.prefix}MODEL_SNAPSHOT": self._process_snapshot,
             f"{self.prefix}JOINTS_HELD": self._process_joints,
             f"{self.prefix}LOCALIZATION_DECISIONS": self._process_decisions,
@@ -341,18 +346,7 @@ class Drive:
         if answer.origin is not None and answer.origin != self.origin:
             self.origin = answer.origin
             self._place_fixes()
-        covariance = found.covariance
-        upper = np.full(6, math.nan) if covariance is None else covariance[:3, :3][_UPPER]
-        self.poses.append(
-            stamp,
-            *found.pose.xyz,
-            *found.pose.wxyz,
-            *upper,
-            answer.horizontal_protection_level,
-            answer.heading_protection_level,
-            found.invalid_reasons,
-            found.pose_epoch,
-        )
+        self.poses.append(stamp, *_make_row(answer))
         invalid, epoch = Invalid(found.invalid_reasons), found.pose_epoch
         if self._invalid is not None and invalid != self._invalid:
             kind = EventKind.INVALID if invalid else EventKind.VALID
@@ -360,6 +354,16 @@ class Drive:
         if self._epoch >= 0 and epoch != self._epoch:
             self._add_event(stamp, EventKind.RESET, f"the position was reset: epoch {epoch}")
         self._invalid, self._epoch = invalid, epoch
+
+    def _process_odometry(self, name: str, stamp: int, data: bytes) -> None:
+        if not 0 <= stamp - self._last_odometry < ODOMETRY_PERIOD_US:
+            self._last_odometry = stamp
+            self.odometry.append(stamp, *_make_row(decode("pose_transform_t", data)))
+
+    @property
+    def motion(self) -> Table:
+        """The poses that speeds are derived from: of odometry, which no fix corrects, where there are some."""
+        return self.odometry if self.odometry.count else self.poses
 
     def _process_joints(self, name: str, stamp: int, data: bytes) -> None:
         # stamp and source alone decide whether the rest is read
@@ -591,6 +595,15 @@ def read_stamp(data: bytes) -> int:
     return int.from_bytes(data[8:16], "big", signed=True) if len(data) >= 16 else 0
 
 
+def _make_row(answer: PoseAnswer) -> tuple[float, ...]:
+    """Return a pose as a row of `Drive.poses`."""
+    found = answer.transformation
+    covariance = found.covariance
+    upper = np.full(6, math.nan) if covariance is None else covariance[:3, :3][_UPPER]
+    levels = (answer.horizontal_protection_level, answer.heading_protection_level)
+    return (*found.pose.xyz, *found.pose.wxyz, *upper, *levels, found.invalid_reasons, found.pose_epoch)
+
+
 def _list_coordinates(model: Model | None) -> frozenset[str]:
     joints = model.joints if model is not None else {}
     return frozenset(name for each in joints.values() for name in coordinate_names(each.name, each.joint))
@@ -679,7 +692,7 @@ def follow_bus(
 ) -> None:
     """Feed the messages of all channels with a prefix, in batches under the lock, until it is stopped.
 
-    A `pause` between batches, seconds, saves half of the processor time, and adds to the time of reception.
+    A `pause` between batches, seconds, saves half of the processor time, and adds to the time of receipt.
     """
     received: list[tuple[str, bytes]] = []
     subscription = bus.subscribe(f"{re.escape(prefix)}.*", lambda channel, data: received.append((channel, data)))

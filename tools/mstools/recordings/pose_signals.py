@@ -1,6 +1,6 @@
 """Signals of poses that are shown as numbers and over time: speed, heading, standard deviation, ellipsoid.
 
-They are derived from rows of `Drive.poses`, see `mstools.recordings.drive`.
+They are derived from rows of `Drive.poses` and `Drive.motion`, see `mstools.recordings.drive`.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import numpy.typing as npt
 
 from modelserver.transforms.pose import Pose
 from modelserver.transforms.so3 import Array, Vector3
-from mstools.recordings.drive import COVARIANCE, EPOCH, QUATERNION, Table
+from mstools.recordings.drive import COVARIANCE, EPOCH, QUATERNION, Drive
 
 SPEED_SPAN_US: Final = 400_000
-"""Time over which positions are differenced to a speed: a correction of the pose by 0.1 m is 0.25 m/s then."""
+"""Time over which positions are differenced to a speed: without odometry a correction of 0.1 m is 0.25 m/s then."""
 
 MAX_GAP_US: Final = 1_000_000
 """Longer gaps between poses interrupt lines and strips, and have no speed."""
@@ -33,16 +33,18 @@ class PoseSignals(NamedTuple):
     sigma: float = math.nan
 
 
-def compute_signals(poses: Table, utime: int) -> PoseSignals:
+def compute_signals(drive: Drive, utime: int) -> PoseSignals:
     """Return the signals of the last pose at or before a time; the speed of the last one is that of the time before."""
-    first, last = np.searchsorted(poses.utimes, (utime - MAX_GAP_US, utime + MAX_GAP_US))
-    utimes, rows = poses.utimes[first:last], poses.rows[first:last]
-    here = int(np.searchsorted(utimes, utime, side="right")) - 1
+    here = drive.poses.find(utime)
     if here < 0:
         return PoseSignals()
-    row = rows[here : here + 1]
+    row = drive.poses.rows[here : here + 1]
+    motion = drive.motion
+    first, last = np.searchsorted(motion.utimes, (utime - MAX_GAP_US, utime + MAX_GAP_US))
+    utimes = motion.utimes[first:last]
+    at = int(np.searchsorted(utimes, utime, side="right")) - 1
     return PoseSignals(
-        float(compute_speeds(utimes, rows)[here]),
+        float(compute_speeds(utimes, motion.rows[first:last])[at]) if at >= 0 else math.nan,
         float(compute_headings(row[:, QUATERNION])[0]),
         float(compute_sigmas(row)[0]),
     )

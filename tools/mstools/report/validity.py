@@ -98,9 +98,7 @@ class ValiditySummary:
 
 def summarize_validity(data: ReplayData) -> ValiditySummary:
     states = data.snapshots
-    # a state of before a step of the clock backward holds for no time
-    held = [min(max(b.t - a.t, 0.0), HOLD_S) for a, b in pairwise(states)]
-    held += [min(max(data.duration - each.t, 0.0), HOLD_S) for each in states[-1:]]
+    held = _find_holds([*(min(max(each.t, 0.0), data.duration) for each in states), data.duration])
     first = next((n for n, each in enumerate(states) if not each.invalid), len(states))
     first_valid = states[first].t if first < len(states) else math.nan
     return ValiditySummary(
@@ -110,6 +108,19 @@ def summarize_validity(data: ReplayData) -> ValiditySummary:
         reasons=_sum_reasons(states, held, data.duration),
         reasons_after=_sum_reasons(states[first:], held[first:], data.duration - first_valid),
     )
+
+
+def _find_holds(times: Sequence[float]) -> list[float]:
+    """Return how long each state holds, seconds; `times` are those of the states and the end.
+
+    Before heading alignment states come in the order of arrival, some a little late: no time counts twice. Beyond
+    `HOLD_S` it was a step of the clock backward, from where time counts on.
+    """
+    held, latest = [], -math.inf
+    for begin, end in pairwise(times):
+        latest = begin if begin < latest - HOLD_S else max(begin, latest)
+        held.append(min(max(end - latest, 0.0), HOLD_S))
+    return held
 
 
 def _sum_reasons(states: Sequence[StateSample], held: Sequence[float], duration: float) -> tuple[InvalidTime, ...]:

@@ -251,7 +251,7 @@ def _describe_pose(drive: Drive, picture: Picture) -> dict[str, Any]:
     """Return the pose of a picture as the strip shows it."""
     if picture.pose is None:
         return {"valid": None, "reason": "no pose"}
-    values = compute_signals(drive.poses, picture.utime)._asdict() | {"level": picture.horizontal_protection_level}
+    values = compute_signals(drive, picture.utime)._asdict() | {"level": picture.horizontal_protection_level}
     return {
         "valid": not picture.invalid,
         "reason": picture.invalid.explain() if picture.invalid else "",
