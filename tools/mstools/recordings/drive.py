@@ -692,7 +692,7 @@ def follow_bus(
 ) -> None:
     """Feed the messages of all channels with a prefix, in batches under the lock, until it is stopped.
 
-    A `pause` between batches, seconds, saves half of the processor time, and adds to the time of receipt.
+    A `pause` between batches, seconds, saves a third of the time of the two threads, and adds to the time of receipt.
     """
     received: list[tuple[str, bytes]] = []
     subscription = bus.subscribe(f"{re.escape(prefix)}.*", lambda channel, data: received.append((channel, data)))
