@@ -5,8 +5,8 @@ The package holds an environment of its own in /usr/lib/modelserver: ModelServer
 versions of the environment that runs this script, for the same Python of Debian, with the extras of `PACKAGED_EXTRAS`.
 Pure Python is copied from that environment; for another architecture compiled packages are downloaded as wheels of the
 same version. Left out is what only filterpy's other filters and plots need, matplotlib and scipy, plotly's Python, of
-which reports use only the script, the extras dynamics (380 MB) and archive, and the packages' own tests. Installing it
-starts nothing: `modelserver install --vehicle FILE` does, and removing it stops what that started.
+which reports use only the script, the extras dynamics (380 MB), archive and map (110 MB), and the packages' own tests.
+Installing it starts nothing: `modelserver install --vehicle FILE` does, and removing it stops what that started.
 """
 
 from __future__ import annotations

@@ -78,8 +78,8 @@ def test_given_the_package_then_its_command_checks_queries_and_replays(package: 
     assert found.stdout == invoke("", "query", *frames, "--model", str(config / "geometry.xml")).stdout
 
 
-NOT_PACKAGED = {"pinocchio", "pyarrow"}
-"""Libraries of the extras dynamics and archive."""
+NOT_PACKAGED = {"pinocchio", "pyarrow", "rasterio"}
+"""Libraries of the extras dynamics, archive and map."""
 
 IMPORT_ALL = """
 import pkgutil, modelserver, msdrivers, mslcm, mstools
@@ -118,10 +118,10 @@ def test_given_the_package_then_the_extras_of_its_commands_work_and_the_missing_
     used = run(package, command=script)
     assert used.returncode == 0, used
     assert used.stdout.endswith(
-        "Extras that are not installed: archive,dynamics. To add them: the Debian package does not have the extra "
-        "archive,dynamics; "
+        "Extras that are not installed: archive,dynamics,map. To add them: the Debian package does not have the extra "
+        "archive,dynamics,map; "
         "in a folder with the source: sudo /usr/bin/python3 -m venv --clear /opt/modelserver && "
-        "sudo /opt/modelserver/bin/pip install '.[archive,dynamics]'\n"
+        "sudo /opt/modelserver/bin/pip install '.[archive,dynamics,map]'\n"
     )
 
 
