@@ -97,7 +97,8 @@ def open_link(
     # nothing is loaded from the internet
     page.on("request", lambda request: None if request.url.startswith(LOCAL) else errors.append(request.url))
     if link.startswith("http"):
-        link += f"{'&' if '?' in link else '?'}fixedDpr={sharpness}"
+        link, mark, panes = link.partition("#")
+        link += f"{'&' if '?' in link else '?'}fixedDpr={sharpness}{mark}{panes}"
     page.goto(link)
     try:
         yield page

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 import re
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from support_bags import ROBOT, write_drive
 from support_browser import needs_browser, open_link, serve, show
+from support_lcm import MODELSERVER
 from support_view import record_drive
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install -e '.[view]'")
@@ -260,3 +263,28 @@ def test_given_a_link_with_a_token_then_page_and_scene_open_and_without_it_neith
             page.get_by_text("the token is missing or wrong").wait_for()
     finally:
         served.close()
+
+
+def test_given_a_bag_then_one_command_shows_its_drive_on_map_and_plots(browser: Browser, tmp_path: Path) -> None:
+    pytest.importorskip("rosbags", reason="the extra bags is not installed: pip install -e '.[bags]'")
+    (tmp_path / "robot.urdf").write_text(ROBOT)
+    bag = write_drive(tmp_path / "drive.bag", tmp_path / "robot.urdf", 60.0)
+    new = [*MODELSERVER, "new", "rover", "--yes", "--from-urdf", "robot.urdf"]
+    subprocess.run(new, cwd=tmp_path, check=True, capture_output=True)
+    command = [*MODELSERVER, "view", str(bag), "-c", "rover/vehicle.yaml", "--no-browser", "--port", "0"]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as shown:
+        try:
+            assert shown.stdout is not None
+            link = shown.stdout.readline().split()[1]
+            with open_link(browser, f"{link}#map,plots") as page:
+                page.wait_for_function("state !== null && state.has_time")
+                page.evaluate("seek(40)")
+                page.get_by_role("status").get_by_text("VALID", exact=True).wait_for()
+                # a figure eight at 2 m/s
+                assert read_figure(page, "speed") == pytest.approx(2.0, abs=0.2)
+                page.wait_for_function("document.querySelector('#map canvas').dataset.vehicle !== undefined")
+                assert int(page.locator("#map canvas").get_attribute("data-fixes") or 0) > 100
+                page.wait_for_function("document.documentElement.dataset.charts !== undefined")
+                assert page.locator("#scene").is_hidden()
+        finally:
+            shown.terminate()
