@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -166,6 +166,14 @@ def choose(page: Page, label: str, option: str) -> None:
             wait_until_sent(page)
             return
     raise AssertionError(f"{label} has no option {option}")
+
+
+def wait_until(page: Page, condition: Callable[[], bool]) -> None:
+    for _ in range(600):
+        if condition():
+            return
+        page.wait_for_timeout(100)
+    raise AssertionError("the condition never held")
 
 
 def wait_until_sent(page: Page) -> None:

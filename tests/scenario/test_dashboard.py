@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from support_bags import ROBOT, write_drive
-from support_browser import needs_browser, open_link, serve, show
+from support_browser import needs_browser, open_link, serve, show, wait_until
 from support_lcm import MODELSERVER
 from support_view import record_drive
 
@@ -216,23 +216,23 @@ def test_given_the_tree_then_a_search_finds_frames_a_click_asks_for_one_and_bodi
     with serve(browser, open_geometry(find_vehicle_file(), {}), path="") as (page, server):
         page.get_by_role("button", name="Tree").click()
         tree = page.get_by_label("Bodies and frames", exact=True)
+        tree.locator("button:visible").first.wait_for()
         tree.get_by_label("Search").fill("lens")
         found = [each.get_attribute("data-frame") for each in tree.locator("button:visible").all()]
         assert found
         assert all("lens" in (each or "").lower() for each in found)
         tree.locator("button:visible").first.click()
         frame = page.frame_locator("#scene iframe").get_by_role("combobox", name="Frame", exact=True)
-        page.wait_for_timeout(1000)
-        assert frame.input_value() == found[0]
+        wait_until(page, lambda: frame.input_value() == found[0])
         tree.get_by_label("Search").fill("")
         node = server.scene.get_handle_by_name("/world/vehicle/body/0")
         assert node is not None
         assert node.visible
         tree.locator("ul input").first.uncheck()
         tree.get_by_label("grid").uncheck()
-        page.wait_for_timeout(1000)
-        assert not node.visible
-        assert not server.scene.get_handle_by_name("/world/grid").visible  # type: ignore[union-attr]
+        grid = server.scene.get_handle_by_name("/world/grid")
+        assert grid is not None
+        wait_until(page, lambda: not node.visible and not grid.visible)
 
 
 def test_given_a_viewer_that_ends_then_the_page_reports_it_and_returns_with_the_next(
@@ -281,9 +281,8 @@ def test_given_a_bag_then_one_command_shows_its_drive_on_map_and_plots(browser: 
                 page.evaluate("seek(40)")
                 page.get_by_role("status").get_by_text("VALID", exact=True).wait_for()
                 # a figure eight at 2 m/s
-                assert read_figure(page, "speed") == pytest.approx(2.0, abs=0.2)
-                page.wait_for_function("document.querySelector('#map canvas').dataset.vehicle !== undefined")
-                assert int(page.locator("#map canvas").get_attribute("data-fixes") or 0) > 100
+                wait_until(page, lambda: read_figure(page, "speed") == pytest.approx(2.0, abs=0.2))
+                page.wait_for_function("Number(document.querySelector('#map canvas').dataset.fixes) > 100")
                 page.wait_for_function("document.documentElement.dataset.charts !== undefined")
                 assert page.locator("#scene").is_hidden()
         finally:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from support_browser import choose, find_fields, needs_browser, show
+from support_browser import choose, find_fields, needs_browser, show, wait_until
 from support_view import follow_drive, record_drive
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install -e '.[view]'")
@@ -56,14 +56,6 @@ def read_value(page: Page, name: str) -> float:
     """Return a number from the table of the answer."""
     row = page.get_by_role("row").filter(has=page.get_by_role("cell", name=name, exact=True))
     return float(row.get_by_role("cell").nth(1).inner_text().split()[0])
-
-
-def wait_until(page: Page, condition: Callable[[], bool]) -> None:
-    for _ in range(600):
-        if condition():
-            return
-        page.wait_for_timeout(100)
-    raise AssertionError("the condition never held")
 
 
 def count_pixels(page: Page, color: tuple[int, int, int]) -> int:

@@ -140,7 +140,7 @@ let treeOf = null;
 async function showTree() {
   if (find("tree").hidden || treeOf === state?.revision) return;
   treeOf = state?.revision;
-  const tree = await fetchJson("/tree");
+  const tree = await fetchJson("/tree").catch((error) => { treeOf = null; throw error; });
   const makeCheck = (name, isShown) => {
     const label = document.createElement("label");
     const check = document.createElement("input");
