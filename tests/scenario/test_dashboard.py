@@ -6,6 +6,7 @@ import math
 import re
 import subprocess
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ import pytest
 from support_bags import ROBOT, write_drive
 from support_browser import needs_browser, open_link, serve, show, wait_until
 from support_lcm import MODELSERVER
+from support_tuning import write_simulated_log
 from support_view import record_drive
 
 pytest.importorskip("viser", reason="the extra view is not installed: pip install -e '.[view]'")
@@ -265,25 +267,46 @@ def test_given_a_link_with_a_token_then_page_and_scene_open_and_without_it_neith
         served.close()
 
 
+@contextmanager
+def run_view(folder: Path, *words: str) -> Iterator[str]:
+    """Run `modelserver view` in a folder; yield the link that it prints."""
+    command = [*MODELSERVER, "view", *words, "--no-browser", "--port", "0"]
+    with subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as shown:
+        try:
+            assert shown.stdout is not None
+            yield shown.stdout.readline().split()[1]
+        finally:
+            shown.terminate()
+
+
 def test_given_a_bag_then_one_command_shows_its_drive_on_map_and_plots(browser: Browser, tmp_path: Path) -> None:
     pytest.importorskip("rosbags", reason="the extra bags is not installed: pip install -e '.[bags]'")
     (tmp_path / "robot.urdf").write_text(ROBOT)
-    bag = write_drive(tmp_path / "drive.bag", tmp_path / "robot.urdf", 60.0)
+    write_drive(tmp_path / "drive.bag", tmp_path / "robot.urdf", 60.0)
     new = [*MODELSERVER, "new", "rover", "--yes", "--from-urdf", "robot.urdf"]
     subprocess.run(new, cwd=tmp_path, check=True, capture_output=True)
-    command = [*MODELSERVER, "view", str(bag), "-c", "rover/vehicle.yaml", "--no-browser", "--port", "0"]
-    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as shown:
-        try:
-            assert shown.stdout is not None
-            link = shown.stdout.readline().split()[1]
-            with open_link(browser, f"{link}#map,plots") as page:
-                page.wait_for_function("state !== null && state.has_time")
-                page.evaluate("seek(40)")
-                page.get_by_role("status").get_by_text("VALID", exact=True).wait_for()
-                # a figure eight at 2 m/s
-                wait_until(page, lambda: read_figure(page, "speed") == pytest.approx(2.0, abs=0.2))
-                page.wait_for_function("Number(document.querySelector('#map canvas').dataset.fixes) > 100")
-                page.wait_for_function("document.documentElement.dataset.charts !== undefined")
-                assert page.locator("#scene").is_hidden()
-        finally:
-            shown.terminate()
+    with (
+        run_view(tmp_path, "drive.bag", "-c", "rover/vehicle.yaml") as link,
+        open_link(browser, f"{link}#map,plots") as page,
+    ):
+        page.wait_for_function("state !== null && state.has_time")
+        assert page.locator("#title").inner_text() == "drive.bag"
+        page.evaluate("seek(40)")
+        page.get_by_role("status").get_by_text("VALID", exact=True).wait_for()
+        # a figure eight at 2 m/s
+        wait_until(page, lambda: read_figure(page, "speed") == pytest.approx(2.0, abs=0.2))
+        page.wait_for_function("Number(document.querySelector('#map canvas').dataset.fixes) > 100")
+        page.wait_for_function("document.documentElement.dataset.charts !== undefined")
+        assert page.locator("#scene").is_hidden()
+
+
+def test_given_a_log_of_sensors_alone_then_all_fixes_and_the_rates_are_shown(browser: Browser, tmp_path: Path) -> None:
+    log, _ = write_simulated_log(tmp_path, 20.0)
+    with run_view(tmp_path, str(log)) as link, open_link(browser, link) as page:
+        page.wait_for_function("document.documentElement.dataset.charts === 'rates,latencies'")
+        page.wait_for_function("Number(document.querySelector('#map canvas').dataset.fixes) > 50")
+        assert page.locator("#scene").is_hidden()
+        assert page.locator("#strip").is_hidden()
+        assert page.get_by_role("status").inner_text().strip() == "NO POSE"
+        names = page.evaluate("[...document.getElementById('charts')._fullData].map(each => each.name)")
+        assert {"GPS", "IMU"} <= set(names)

@@ -145,7 +145,7 @@ def test_given_a_log_of_fixes_alone_then_its_charts_and_map_are_there(tmp_path: 
     state = page.get("/state")
     assert state["valid"] is None
     assert state["seconds"] == pytest.approx(9.75)
-    assert "only track, fixes and rates" in page.dashboard._source.notes[0]
+    assert "-c vehicle.yaml runs the localization" in page.dashboard._source.notes[0]
     assert len(page.get("/map", width="800", height="400")["fixes"]) > 30
     rates = page.get("/charts", **{"from": "0", "to": "9", "names": "rates"})["data"]
     assert [each["name"] for each in rates] == ["GPS"]

@@ -112,6 +112,9 @@ def command(
             shown = stack.enter_context(open_localized(stack.enter_context(open_lcm_log(file)), config))
         source = open_source(shown, model, settings, url, prefix, timeout, editing, package_path or ())
         stack.callback(source.close)
+        if file is not None and shown != file:
+            # a bag is shown by a log made of it
+            source.title = file.name
         if ground is not None and not source.has_time:
             raise typer.BadParameter("goes with a log or --live, which have a map", param_hint="--map")
         try:

@@ -115,6 +115,7 @@ class Dashboard:
             state: dict[str, Any] = {
                 "title": source.title,
                 "has_time": source.has_time,
+                "has_poses": bool(drive.poses.count),
                 "is_live": source.is_live,
                 "follows": source.is_live and not shown.utime,
                 "is_playing": shown.is_playing,

@@ -176,10 +176,11 @@ def open_log(path: Path, prefix: str = "", model: Path | None = None, packages: 
     except RecordingError as error:
         if not drive.begin:
             raise
-        notes.append(f"only track, fixes and rates are shown: {error}")
+        if drive.poses.count:
+            notes.append(f"only track, fixes and rates are shown: {error}")
         answers = NoGeometry(f"in {path}")
     if not drive.poses.count:
-        notes.append("no pose of the service is in it: -c vehicle.yaml runs the localization on it")
+        notes.append("fixes and rates are shown; -c vehicle.yaml runs the localization on it, which has no pose yet")
     folder = model.resolve().parent if model is not None else None
     return Source(path.name, drive, answers, MeshFolders(folder, tuple(packages)), notes=tuple(notes))
 

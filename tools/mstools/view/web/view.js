@@ -6,6 +6,7 @@ const POLL_MS = 250;
 // without a change nothing is asked more often than this
 const IDLE_MS = 1000;
 const LIVE_SPAN_S = 120;
+const SENSOR_CHARTS = ["rates", "latencies"];
 const DEFAULT_CHARTS = ["speed", "heading", "uncertainty", "innovations"];
 
 // names this page's scene among those of others
@@ -195,9 +196,18 @@ function searchTree() {
 
 // a link can choose: /#map,plots
 const linked = location.hash.slice(1).split(",").filter((each) => find(each));
-const panes = linked.length
+const DEFAULT_PANES = { scene: true, map: false, plots: true };
+let panes = linked.length
   ? Object.fromEntries(linked.map((each) => [each, true]))
-  : recall("panes", { scene: true, map: false, plots: true });
+  : recall("panes", DEFAULT_PANES);
+
+// sensors alone: all fixes and the rates, where scene, speed and heading would be empty
+function showSensors() {
+  if (!linked.length) panes = { map: true, plots: true };
+  chosen = SENSOR_CHARTS;
+  showPanes();
+  return seek(state.seconds);
+}
 
 function showPanes() {
   const hasTime = state === null || state.has_time;
@@ -281,7 +291,8 @@ async function loadCharts() {
     const [strip, figures] = await Promise.all([
       fetchJson(`/strip?from=${from}&to=${to}`), fetchJson(`/charts?from=${from}&to=${to}&names=${encodeURIComponent(names)}`),
     ]);
-    await showFigure(find("strip"), strip);
+    find("strip").hidden = !state.has_poses;
+    if (state.has_poses) await showFigure(find("strip"), strip);
     await showFigure(find("charts"), figures);
     root.dataset.charts = names;
   } catch (error) {
@@ -364,6 +375,7 @@ async function poll() {
     const before = state;
     state = await fetchJson("/state");
     const text = JSON.stringify(state);
+    if (!before && state.has_time && !state.is_live && !state.has_poses) showSensors();
     showStrip();
     if (before?.has_time !== state.has_time) showPanes();
     showTree();
