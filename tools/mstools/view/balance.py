@@ -23,6 +23,7 @@ from modelserver.transforms import so3
 from modelserver.transforms.so3 import Array
 from mstools.recordings.pose_signals import CHI_SQUARE_3, compute_ellipsoid
 from mstools.view.page import escape_markdown, format_table
+from mstools.view.scene import INVALID_COLOR, Rgb
 
 NODE: Final = "/world/vehicle/dynamics"
 CONTACTS: Final = "*Contact"
@@ -41,11 +42,9 @@ COLUMN_SCALE: Final = 0.02
 COLUMN_DISTANCE: Final = 0.12
 """Distance of a column from its contact, away from the others, likewise: beside the wheel."""
 
-Rgb = tuple[int, int, int]
 CENTER_COLOR: Final[Rgb] = (150, 60, 200)
 EDGE_COLOR: Final[Rgb] = (0, 130, 110)
 WEAK_COLOR: Final[Rgb] = (213, 94, 0)
-TIPPING_COLOR: Final[Rgb] = (225, 70, 60)
 
 
 class Balance(NamedTuple):
@@ -81,7 +80,6 @@ class Balancer:
     """Computes the balance of a model. Raises ModelServerError as `Dynamics` does, where the extra is missing too."""
 
     def __init__(self, model: Model, base_frame: str, settings: DynamicsSettings):
-        self._model = model
         uncertainty = MassUncertainty(settings.mass_sigma, settings.center_sigma, unstated_is_exact=True)
         # what was left out is named in the notes
         self._dynamics = model.dynamics(
@@ -156,7 +154,7 @@ class BalanceScene:
         foot = balance.foot
         corners = list(zip(balance.corners, (*balance.corners[1:], *balance.corners[:1]), strict=True))
         is_tipping = balance.margin is not None and balance.margin < 0.0
-        self._lines["weak"].colors = np.array(TIPPING_COLOR if is_tipping else WEAK_COLOR, np.uint8)
+        self._lines["weak"].colors = np.array(INVALID_COLOR if is_tipping else WEAK_COLOR, np.uint8)
         self._draw("plumb", [] if foot is None else [(center.position, foot)])
         for name, is_weak in (("edges", False), ("weak", True)):
             chosen = [each for each in corners if (set(each) == set(balance.edge)) == is_weak]
@@ -253,12 +251,11 @@ class BalancePanel:
         patterns = [each.strip() for each in names.split(",") if each.strip()]
         contacts = find_contacts(model, patterns)
         roll, pitch = (math.radians(each.value) for each in (self._roll, self._pitch))
-        plain = self._balancer.compute(joints, roll, pitch, ())
-        if contacts == (CONTACTS,):
-            return plain
         try:
-            return self._balancer.compute(joints, roll, pitch, contacts)
+            return self._balancer.compute(joints, roll, pitch, () if contacts == (CONTACTS,) else contacts)
         except ModelServerError as error:
+            # the center is known without contacts; what else is wrong is raised again
+            plain = self._balancer.compute(joints, roll, pitch, ())
             return plain._replace(notes=(*plain.notes, str(error)))
 
 

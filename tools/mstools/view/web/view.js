@@ -196,10 +196,9 @@ function searchTree() {
 
 // a link can choose: /#map,plots
 const linked = location.hash.slice(1).split(",").filter((each) => find(each));
-const DEFAULT_PANES = { scene: true, map: false, plots: true };
 let panes = linked.length
   ? Object.fromEntries(linked.map((each) => [each, true]))
-  : recall("panes", DEFAULT_PANES);
+  : recall("panes", { scene: true, map: false, plots: true });
 
 // sensors alone: all fixes and the rates, where scene, speed and heading would be empty
 function showSensors() {
