@@ -122,11 +122,14 @@ def _interrupt(x: Array, *values: Array, at: npt.NDArray[np.bool_]) -> tuple[Arr
     return np.insert(x, where, x[where]), *(np.insert(each, where, math.nan) for each in values)
 
 
-def _select_poses(table: Table, span: Span) -> tuple[Array, Array, npt.NDArray[np.bool_]]:
-    """Return seconds and rows of poses, and before which of them lines are interrupted."""
+def _select_poses(table: Table, span: Span) -> tuple[npt.NDArray[np.int64], Array, npt.NDArray[np.bool_]]:
+    """Return times and rows of poses, and before which of them lines are interrupted."""
     utimes, rows = span.select(table)
-    cut = np.append(False, (np.diff(utimes) > MAX_GAP_US) | (np.diff(rows[:, EPOCH]) != 0))[: len(utimes)]
-    return span.to_seconds(utimes), rows, cut
+    return (
+        utimes,
+        rows,
+        np.append(False, (np.diff(utimes) > MAX_GAP_US) | (np.diff(rows[:, EPOCH]) != 0))[: len(utimes)],
+    )
 
 
 def _make_axis(label: str, values: Sequence[Array], least: float, floor: float | None = None) -> Axis:
@@ -144,22 +147,22 @@ def _make_axis(label: str, values: Sequence[Array], least: float, floor: float |
 
 
 def _make_speed(drive: Drive, span: Span) -> Panel:
-    seconds, rows, cut = _select_poses(drive.motion, span)
-    x, y = _interrupt(seconds, compute_speeds(span.select(drive.motion)[0], rows), at=cut)
+    utimes, rows, cut = _select_poses(drive.motion, span)
+    x, y = _interrupt(span.to_seconds(utimes), compute_speeds(utimes, rows), at=cut)
     return Panel("Speed", _make_axis("m/s", [y], 1.0, 0.0), [Series("", x, y)])
 
 
 def _make_heading(drive: Drive, span: Span) -> Panel:
-    seconds, rows, cut = _select_poses(drive.poses, span)
+    utimes, rows, cut = _select_poses(drive.poses, span)
     headings = compute_headings(rows[:, QUATERNION])
     cut = cut | np.append(False, np.abs(np.diff(headings)) > 180.0)[: len(cut)]
-    x, y = _interrupt(seconds, headings, at=cut)
+    x, y = _interrupt(span.to_seconds(utimes), headings, at=cut)
     return Panel("Heading (from grid north)", _make_axis("deg", [y], 5.0), [Series("", x, y)])
 
 
 def _make_uncertainty(drive: Drive, span: Span) -> Panel:
-    seconds, rows, cut = _select_poses(drive.poses, span)
-    x, sigma, level = _interrupt(seconds, compute_sigmas(rows), rows[:, HORIZONTAL], at=cut)
+    utimes, rows, cut = _select_poses(drive.poses, span)
+    x, sigma, level = _interrupt(span.to_seconds(utimes), compute_sigmas(rows), rows[:, HORIZONTAL], at=cut)
     series = [Series("protection level", x, level, charts.ORANGE), Series("sigma", x, sigma, charts.BLUE)]
     return Panel("Horizontal uncertainty", _make_axis("m", [sigma, level], 0.1, 0.0), series)
 

@@ -33,7 +33,7 @@ FILE_UTIME: Final = 10**15
 
 
 BATCH_S: Final = 0.01
-"""Pause between batches of messages, seconds: a third of a picture, and what a latency may be too large."""
+"""Pause between batches of messages, seconds: a quarter of a picture, and what a latency may be too large."""
 
 
 @dataclass
